@@ -204,11 +204,8 @@ def in_stretches(recordings: Recordings, *, hidden_velocities: bool | Literal["a
     counts = np.bincount(recordings.recording)
     parts = -(-cut * counts // count)  # rounded up
     rows = [np.arange(n) * each // n for n, each in zip(counts, parts, strict=True)]
-    labels = [
-        label if each == 1 else f"{label} ({number} of {each})"
-        for label, each in zip(recordings.labels, parts, strict=True)
-        for number in range(1, each + 1)
-    ]
+    names = zip(recordings.labels, parts, strict=True)
+    labels = [f"{name} ({number} of {each})" for name, each in names for number in range(1, each + 1)]
     remark = Remark("data.cut_recording", {"stretches": int(parts.sum()), "of": several})
     return replace(
         recordings, labels=tuple(labels), remarks=(*recordings.remarks, remark),

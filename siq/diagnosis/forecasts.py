@@ -530,9 +530,14 @@ def _fitted_at(
     untried.pop(candidate.label, None)
     if not all(each.fit.converged or each.fit.model.edges for each in found):
         untried[candidate.label] = NotFitted.of(candidate, NumericalFailure(UNSETTLED))
-    pairs = list(zip(found, horizons, strict=True))
+    return found, _gain_over(found, horizons)
+
+
+def _gain_over(one: Sequence[Horizon], other: Sequence[Horizon]) -> float:
+    """What fits at every horizon gain over others."""
+    pairs = zip(one, other, strict=True)
     gains = [(a.log_density - b.log_density) / min(a.correlated, b.correlated) for a, b in pairs]
-    return found, float(np.mean(gains))
+    return float(np.mean(gains))
 
 
 def _next_rung(
@@ -753,6 +758,48 @@ def _needed(
     return _takes_most(before, after, without, context.data, surely=False)
 
 
+def _exchanged(found: list[_Rung], alone: Sequence[Horizon], context: FitContext) -> list[_Rung]:
+    """A climb with a mechanism exchanged for one that was not told apart from it, where that foresees better.
+
+    A delay and a lag may look alike as long as friction is missing, too. What is exchanged comes last: it may
+    bring a state of its own, on which no other mechanism is put.
+    """
+    for place, rung in enumerate(found[:-1]):
+        best, same = rung.accepted.best, rung.accepted.others["same"]
+        for other in same:
+            less = (best, *(each for each in same if each is not other))
+            last = replace(rung, accepted=AcceptedMechanism(other, {"same": (), "less": less}))
+            rungs, horizons = found[:place], found[place - 1].horizons if place else alone
+            for each in (*found[place + 1 :], last):
+                above = _on_top(horizons, each, context)
+                if above is None:
+                    break
+                rungs, horizons = [*rungs, above], above.horizons
+            else:
+                gain = _gain_over(horizons, found[-1].horizons)
+                LOGGER.info("%s, for %s: gains %.1f", other.candidate.label, best.candidate.label, gain)
+                if gain > context.study.search.least_log_odds:
+                    return rungs
+    return found
+
+
+def _on_top(horizons: Sequence[Horizon], rung: _Rung, context: FitContext) -> _Rung | None:
+    """The mechanism of a rung fitted on top of other fits; None where it does not settle there."""
+    base, label = horizons[0].fit, rung.accepted.best.candidate.label
+    if base.model.dimension > context.model.dimension:
+        return None
+    (plain,) = (each for each in context.candidates if each.label == label)
+    candidate = plain.rebased(context.model, base.model)
+    for probe in Probe.along(candidate, base, context.data):
+        failed, site = dict[str, NotFitted](), _Site((probe,), 0.0, 0.0, ("", ()), candidate)
+        fitted = _fitted_at(horizons, site, context.budget, failed)
+        if fitted is not None and not failed:
+            fit, blocks = fitted[0][0].fit, context.study.search.blocks
+            whole = FittedCandidate.of(fit, base, context.data, candidate, blocks=blocks)
+            return replace(rung, accepted=replace(rung.accepted, best=whole), horizons=tuple(fitted[0]))
+    return None
+
+
 def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[_Rung], list[NotFitted], list[_Rung]]:
     """Mechanisms one on top of the other, as long as the next is likelier than what has no name.
 
@@ -786,6 +833,7 @@ def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[_Rung], li
             LOGGER.info("found %s by forecasts", rung.accepted.best.candidate.label)
             found.append(rung)
             horizons = list(rung.horizons)
+        found = _exchanged(found, alone, context)
     except (*NUMERICAL_ERRORS, BudgetSpent) as error:
         LOGGER.info("forecasts end: %s", error)
 

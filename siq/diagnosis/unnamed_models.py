@@ -178,8 +178,7 @@ def _with_smooth_term(
             break
         found = AugmentedModel((*before, parts[0]), parts[0].fit)
         LOGGER.info(
-            "%s, %d bumps: log-likelihood %.1f",
-            candidate.label, function.width, found.fit.log_likelihood,
+            "%s, %d bumps: log-likelihood %.1f", candidate.label, function.width, found.fit.log_likelihood,
         )  # fmt: skip
         if likeliest is not None:
             new = {

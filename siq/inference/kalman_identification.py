@@ -114,9 +114,8 @@ def identify_by_likelihood(
     if not wholes:
         raise faults[0]
     price = np.log(len(data.t)) / 2  # Schwarz's, for each noise
-    whole = max(
-        wholes, key=lambda one: one.restricted_likelihood(data) - price * np.count_nonzero(one.noise.process)
-    )
+    worth = [one.restricted_likelihood(data) - price * (one.noise.process > 0).sum() for one in wholes]
+    whole = wholes[int(np.argmax(worth))]
     if slow:  # the state is hidden by what has a memory, and steps are small
         x, values = whole.linearised_at, whole.model.values
         observation = _with_time_of(whole, observation, data)

@@ -257,10 +257,8 @@ class ObservationModel:
 
             x, (slope, rate) = data.outputs[:, 0], values[-2:]
             kept = float(np.exp(rate * np.median(data.step[data.begins])))
-            means = [
-                lfilter([1 - kept], [1, -kept], one, zi=kept * one[:1])[0]
-                for one in np.split(x, data.first[1:-1])
-            ]
+            parts = np.split(x, data.first[1:-1])
+            means = [lfilter([1 - kept], [1, -kept], one, zi=kept * one[:1])[0] for one in parts]
             return np.column_stack([x, -slope / rate * np.concatenate(means)])
         if self.slow_force or self.sensor_time is not None:
             return np.column_stack([data.outputs, np.zeros(len(data.t))])

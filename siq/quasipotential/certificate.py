@@ -180,7 +180,16 @@ def certify(
     found, portrait, options, seed = evidence.found, evidence.portrait, evidence.options, evidence.seed
     wells = () if isinstance(formulas, SymbolicDecomposition) else tuple(formulas)
     if isinstance(formulas, SymbolicDecomposition):
-        scope, candidates = "region", [_candidate_of_region(formulas, evidence, relative_error)]
+        scope, symbols, d = "region", formulas.symbols, len(formulas.symbols)
+        second = compile_formulas([one.diff(x) for one in formulas.gradient for x in symbols], symbols)
+        region = Candidate(
+            formulas.values, lambda x: formulas.evaluate_gradient(np.ascontiguousarray(x.T)).T,
+            lambda x: second(np.ascontiguousarray(x.T)).T.reshape(-1, d, d),
+            lambda x: formulas.evaluate(np.ascontiguousarray(x.T))[1 : d + 1].T,
+            evidence.points, portrait.attractors, relative_error, evidence.pairs, evidence.references,
+            tested_on=f"{len(evidence.points)} held-out states",
+        )  # fmt: skip
+        candidates = [region]
     else:
         scope, candidates = "wells", [_candidate_in_well(well, evidence) for well in wells]
     verdicts: dict[str, list[Verdict]] = {}
@@ -253,20 +262,6 @@ def certify_wells(
         if again.certified:
             return powers, again
     return chosen, certificate
-
-
-def _candidate_of_region(
-    formulas: SymbolicDecomposition, evidence: Evidence, relative_error: float
-) -> Candidate:
-    symbols, d = formulas.symbols, len(formulas.symbols)
-    second = compile_formulas([one.diff(symbol) for one in formulas.gradient for symbol in symbols], symbols)
-    return Candidate(
-        formulas.values, lambda x: formulas.evaluate_gradient(np.ascontiguousarray(x.T)).T,
-        lambda x: second(np.ascontiguousarray(x.T)).T.reshape(-1, d, d),
-        lambda x: formulas.evaluate(np.ascontiguousarray(x.T))[1 : d + 1].T,
-        evidence.points, evidence.portrait.attractors, relative_error, evidence.pairs, evidence.references,
-        tested_on=f"{len(evidence.points)} held-out states",
-    )  # fmt: skip
 
 
 def _candidate_in_well(well: Well, evidence: Evidence) -> Candidate:

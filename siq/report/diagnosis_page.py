@@ -230,8 +230,7 @@ def mismatch_page(findings: Findings, *, title: str, commands: Sequence[str], or
         mechanism_sentences=[
             (each.name, entry.sentence) for each, entry in named if not statement.random_forces
         ],
-        errors=_errors_table(findings, of_outputs),
-        formulas=formulas,
+        errors=_errors_table(findings, of_outputs), formulas=formulas,
         mechanism_parameters=_parameters_of(findings.named, of=True),
         references=list(
             dict.fromkeys((each.name, entry.reference) for each, entry in known if entry.reference)
@@ -260,8 +259,7 @@ def mismatch_page(findings: Findings, *, title: str, commands: Sequence[str], or
         if findings.wells.empty
         else findings.wells.replace({"": None})
         .replace({"simulation": texts("tables")["simulations"]})
-        .dropna(axis=1, how="all"),
-        escape=_escape_times(findings.escape),
+        .dropna(axis=1, how="all"), escape=_escape_times(findings.escape),
         bounds=pd.DataFrame([
             {
                 "mechanism": label, "parameter": bound.parameter,
@@ -430,12 +428,8 @@ def _parameters_of(parts: Sequence[StatedTerm], *, of: bool = False) -> pd.DataF
 def _curve(part: StatedTerm) -> pd.DataFrame:
     curve = part.curve
     assert curve is not None
-    return pd.DataFrame(
-        {
-            curve.coordinate: [value_text(at, digits=3) for at in curve.at],
-            "value": list(map(value_text, curve.value, curve.standard_error)),
-        }
-    )
+    values = list(map(value_text, curve.value, curve.standard_error))
+    return pd.DataFrame({curve.coordinate: [value_text(at, digits=3) for at in curve.at], "value": values})
 
 
 def _odds_text(log_odds: float | None) -> str:

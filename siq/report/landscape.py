@@ -106,8 +106,7 @@ def _wells_table(summary: LandscapeSummary) -> tuple[pd.DataFrame, pd.DataFrame]
                for name, error in zip(summary.names, well.position_errors.tolist(), strict=True)}
             | {
                 "depth": well.depth, "depth_error": well.depth_error, "depth_over_noise": ratio,
-                "depth_over_noise_error": ratio_error,
-                "mean_time": math.nan if mean is None else mean.value,
+                "depth_over_noise_error": ratio_error, "mean_time": math.nan if mean is None else mean.value,
                 "mean_time_relative_error": math.nan if mean is None else mean.error,
                 "next": well.beyond or "",
                 "share_of_domain" if summary.given else "share_of_recorded_states": well.basin,
@@ -171,8 +170,7 @@ def _exits_table(summary: LandscapeSummary) -> tuple[pd.DataFrame, pd.DataFrame]
                 "start": start, "end": end,
                 **{f"saddle_{name}": value for name, value in zip(summary.names, way.place, strict=True)},
                 "barrier": way.barrier, "barrier_error": way.error, "minimum_action": action,
-                "prefactor": law.prefactor,
-                "mean_time": np.nan if mean is None else mean.value,
+                "prefactor": law.prefactor, "mean_time": np.nan if mean is None else mean.value,
                 "data_error": np.nan if mean is None else mean.data_error,
                 "law_error": np.nan if mean is None else mean.law_error,
             }

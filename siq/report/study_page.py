@@ -142,12 +142,10 @@ def study_page(
         printed |= {"simulation": None}
 
     return compose(
-        "study.j2",
-        title=study.title or (given.title if given is not None else "") or study.name,
+        "study.j2", title=study.title or (given.title if given is not None else "") or study.name,
         interactive=results.interactive, study=study, results=results, s=summary, given=given is not None,
         run=run, method=str(method), beside_paper=beside_paper, command=command, origin=origin,
-        help=texts("help"), words=texts("certificate"),
-        answer=_answer(results),
+        help=texts("help"), words=texts("certificate"), answer=_answer(results),
         certificate=certificate if summary is None else summary.stating(certificate),
         lead=lead, figures=figures, record=record,
         certified=0 if rrmse is None else int(rrmse[rrmse["method"] == method]["certified"].sum()),
@@ -158,10 +156,8 @@ def study_page(
         no_record_test=str((certificate or {}).get("no_record_test") or ""),
         record_table=None if record is None else record_table(record, results.time_unit),
         run_lines=paragraphs("runs.j2", r=_run_figures(results.tables, runs=study.runs, method=str(method))),
-        control=_control_counts(certificates),
-        without_landscape=_without_landscape(results.tables),
-        compared=compared,
-        comparison=None if compared is None else comparison_table(compared),
+        control=_control_counts(certificates), without_landscape=_without_landscape(results.tables),
+        compared=compared, comparison=None if compared is None else comparison_table(compared),
         compared_notes=[]
         if compared is None
         else [  # what could not be compared with the equations, and the numbers that it is of
@@ -171,28 +167,19 @@ def study_page(
         tests=None if run is None else _tests_table(certificates, run, method),
         landscape_errors=None if errors is None else errors_over_runs(errors),
         escape=None if escape is None else escape.rename(columns=lambda name: name.replace("_", " ")),
-        time_unit=results.time_unit,
-        troubled=_troubled(study, results),
-        remarks=_remarks(results),
+        time_unit=results.time_unit, troubled=_troubled(study, results), remarks=_remarks(results),
         barriers_over_runs=None
         if landscape is None or landscape["run"].nunique() == 1
         else _counted_over_runs(
-            landscape[landscape["kind"] == "transition"],
-            "item",
-            runs=("barrier", "size"),
-            mean=("barrier", "mean"),
-            lowest=("barrier", "min"),
-            highest=("barrier", "max"),
-            by_the_path_alone=("minimum_action", "mean"),
-            prefactor=("prefactor", "mean"),
+            landscape[landscape["kind"] == "transition"], "item", runs=("barrier", "size"),
+            mean=("barrier", "mean"), lowest=("barrier", "min"), highest=("barrier", "max"),
+            by_the_path_alone=("minimum_action", "mean"), prefactor=("prefactor", "mean"),
         ),
         invariant_missing=density,
         invariant=None if invariant is None else in_words(invariant.rename(columns=headings)),
         well_shares=None
         if shares is None or invariant is None
-        else in_words(shares.rename(columns=headings)),
-        sweep=study.sweep,
-        tables=results.tables,
+        else in_words(shares.rename(columns=headings)), sweep=study.sweep, tables=results.tables,
         folder=results.folder,
         bifurcations=None if given is None else _bifurcations(given, study.sweep, table("bifurcations")),
         swept_wells=[well_name(int(well)) for well in sorted(set(swept)) if well >= 0],
@@ -201,8 +188,7 @@ def study_page(
         published_certificate=results.certificates.get(str(Method.REGRESSION)),
         published_runs=_method_tables(results.tables, (str(Method.REGRESSION),))
         if several and other
-        else None,
-        networks="network"
+        else None, networks="network"
         in (study.refinement.with_routes(networks=study.training is not None).routes or ()),
         steps=results.tables["outcomes"].drop(columns=[] if several else "run"),
         machine=f"{named}; {machine}, {os.cpu_count()} cores",
@@ -565,20 +551,19 @@ def _tests_table(certificates: pd.DataFrame, run: int, method: Method) -> pd.Dat
     mine = certificates[(certificates["run"] == run) & (certificates["method"] == method)]
     words = texts("certificate")
     asks, refutes, verdicts = words["asks"], words["refutes"], words["verdicts"]
-    return pd.DataFrame(
-        {
-            "test": [str(name).replace("_", " ") for name in mine["test"]],
-            "what it asks": [asks.get(str(name), "") for name in mine["test"]],
-            "found": mine["value"].to_numpy(),
-            "limit": mine["limit"].to_numpy(),
-            "verdict": [
-                verdicts["passed" if passed else "failed" if tested else "not_tested"]
-                for passed, tested in zip(mine["passed"], mine["tested"], strict=True)
-            ],
-            "what would refute it": [refutes.get(str(name), "") for name in mine["test"]],
-            "in words": mine["reason"].to_numpy(),
-        }
-    )
+    columns = {
+        "test": [str(name).replace("_", " ") for name in mine["test"]],
+        "what it asks": [asks.get(str(name), "") for name in mine["test"]],
+        "found": mine["value"].to_numpy(),
+        "limit": mine["limit"].to_numpy(),
+        "verdict": [
+            verdicts["passed" if passed else "failed" if tested else "not_tested"]
+            for passed, tested in zip(mine["passed"], mine["tested"], strict=True)
+        ],
+        "what would refute it": [refutes.get(str(name), "") for name in mine["test"]],
+        "in words": mine["reason"].to_numpy(),
+    }
+    return pd.DataFrame(columns)
 
 
 def _control_counts(certificates: pd.DataFrame) -> dict[str, int] | None:

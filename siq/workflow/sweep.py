@@ -383,8 +383,7 @@ class Sweep:
 
 def sweep(
     system: str | Path | Dynamics, parameter: str, values: Sequence[float] | np.ndarray, *,
-    second: tuple[str, Sequence[float] | np.ndarray] | None = None, noise: float | None = None,
-    seed: int = 0,
+    second: tuple[str, Sequence[float] | np.ndarray] | None = None, noise: float | None = None, seed: int = 0,
 ) -> Sweep:  # fmt: skip
     """The landscape of equations against a parameter: equilibria, barriers, escape times and weights.
 

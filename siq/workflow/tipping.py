@@ -155,19 +155,13 @@ def probability_of_tipping(
         (~valid & (drift >= law), Remark("workflow.drift_faster_than_relaxation")),
     ]
     at = np.searchsorted(fine, times)
-    return pd.DataFrame(
-        {
-            "time": times,
-            "value": value[at],
-            "rate": np.where(ended | unknown, np.nan, rate)[at],
-            "probability": -np.expm1(-integral[at]),
-            "law_error": law[at],
-            "drift_error": drift[at],
-            "error": error[at],
-            "valid": valid[at],
-            "note": [next((sentence(remark) for holds, remark in reasons if holds[k]), "") for k in at],
-        }
-    )
+    columns = {
+        "time": times, "value": value[at], "rate": np.where(ended | unknown, np.nan, rate)[at],
+        "probability": -np.expm1(-integral[at]), "law_error": law[at], "drift_error": drift[at],
+        "error": error[at], "valid": valid[at],
+        "note": [next((sentence(remark) for holds, remark in reasons if holds[k]), "") for k in at],
+    }  # fmt: skip
+    return pd.DataFrame(columns)
 
 
 def _regimes(

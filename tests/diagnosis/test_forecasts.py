@@ -9,15 +9,24 @@ from functools import cache
 
 import numpy as np
 import pytest
-from homes_of_mechanisms import HOMES, candidates, model_of, numbers, states
+from homes_of_mechanisms import (
+    HOMES,
+    Resident,
+    candidates,
+    model_of,
+    numbers,
+    recorded as recorded_at_home,
+    states,
+)
 
 from siq.data.recordings import Recordings
 from siq.diagnosis import forecasts, mechanisms
 from siq.diagnosis.dictionary import roles_of, standard_dictionary
-from siq.diagnosis.evidence import NotFitted
+from siq.diagnosis.evidence import FittedCandidate, NotFitted
 from siq.diagnosis.forecasts import (
     FOLDS,
     Horizon,
+    _exchanged,
     _fold_of,
     _Foreseen,
     _gained,
@@ -27,6 +36,7 @@ from siq.diagnosis.forecasts import (
     _log_priors,
     _needed,
     _next_rung,
+    _on_top,
     _Rung,
     _Site,
     _takes_most,
@@ -36,7 +46,7 @@ from siq.diagnosis.forecasts import (
 from siq.diagnosis.holdout import preferred_recalibration
 from siq.diagnosis.mechanisms import MechanismCandidate, candidates_of
 from siq.diagnosis.screening import Probe, Term, linearised_with
-from siq.diagnosis.search import FitContext
+from siq.diagnosis.search import AcceptedMechanism, FitContext
 from siq.errors import NumericalFailure
 from siq.inference.budget import Budget
 from siq.inference.kalman_filter import Linearisation, Noise, Whitened, whiten
@@ -348,6 +358,35 @@ def test_one_that_those_after_it_make_needless_is_climbed_without(monkeypatch: p
     # Not if it foresees worse without it.
     monkeypatch.setattr(forecasts, "typically_better", lambda *_: True)
     assert climb(fit, context)[1] == [damped(), damped()]
+
+
+@pytest.mark.parametrize(("truth", "values"), [("actuator lag", {"tau": 0.5}), ("input delay", {"tau": 0.5})])
+def test_what_came_first_is_exchanged_for_what_foresees_better_beside_the_rest(
+    truth: str, values: dict[str, float]
+) -> None:
+    """A delay and a lag of what drives look alike as long as damping is missing, too."""
+    data = recorded_at_home(Resident(truth, "mass", values))
+    card = {
+        "time_unit": "s", "states": states(x="m", v="m/s"), "inputs": {"u": {"unit": "N"}},
+        "parameters": numbers(k=4.0, m_=1.0), "equations": {"x": "v", "v": "(-k*x + u)/m"},
+        "outputs": {"x": "x"},
+    }  # fmt: skip
+    context = context_of(model_of(card), data, ("actuator lag", "input delay", "linear damping"))
+    alone = _horizons_of(recalibrate(context.model, data)[0], context)
+
+    def rung(horizons: Sequence[Horizon], name: str, *same: FittedCandidate) -> _Rung:
+        candidate = next(each for each in context.candidates if each.name == name)
+        best = replace(damped().accepted.best, candidate=candidate)
+        accepted = AcceptedMechanism(best, {"same": same, "less": ()})
+        found = _on_top(horizons, replace(damped(), accepted=accepted), context)
+        assert found is not None
+        return found
+
+    other = rung(alone, "actuator lag")
+    first = rung(alone, "input delay", other.accepted.best)
+    found = [first, rung(first.horizons, "linear damping")]
+    names = [each.accepted.best.candidate.name for each in _exchanged(found, alone, context)]
+    assert names == (["linear damping", truth] if truth == "actuator lag" else [truth, "linear damping"])
 
 
 def test_a_general_form_whose_amplitude_is_zero_within_errors_is_its_special_case() -> None:

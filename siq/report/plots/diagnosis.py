@@ -447,9 +447,7 @@ def plot_curves(
             Line2D([], [], color=VERMILLION, linestyle="--", marker="s", markersize=4, label="after"),
             Patch(color=GREY, alpha=0.3, label="± 2 standard errors"),
         ],
-        loc="outside upper left",
-        ncols=3,
-        columnspacing=1.2,
+        loc="outside upper left", ncols=3, columnspacing=1.2,
     )  # fmt: skip
     return figure
 

@@ -270,8 +270,7 @@ def _draw_curve(axes: Axes, landscape: LandscapeSummary) -> list[Any]:
         thinned = landscape.points[:: max(len(landscape.points) // MOST_POINTS, 1), 0]
         axes.plot(
             thinned, np.full(len(thinned), 0.012), transform=axes.get_xaxis_transform(), marker="|",
-            color=GREY,
-            markersize=6, alpha=0.25, linestyle="none", rasterized=True,
+            color=GREY, markersize=6, alpha=0.25, linestyle="none", rasterized=True,
         )  # fmt: skip
         handles.append(Line2D([], [], linestyle="none", marker="|", color=GREY, label="recorded states"))
     for way in landscape.ways:
