@@ -231,7 +231,7 @@ def test_what_is_held_out_of_a_single_recording_goes_on_from_what_was_learned(
     np.testing.assert_array_equal(case.kept.t[scored_rows(case.kept)], table["t"].to_numpy()[learned:])
 
 
-@pytest.mark.parametrize("drag", [0.005, 0.5])
+@pytest.mark.parametrize("drag", [0.005, pytest.param(0.5, marks=pytest.mark.slow)])
 def test_drag_is_named_from_one_drop_of_45_heights(drag: float, tmp_path: Path) -> None:
     """Free fall is off by a tenth, or by nearly all; process noise could explain any 45 heights."""
     diagnosis = solve_case(falling_ball(drag).read(tmp_path))

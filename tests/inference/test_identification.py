@@ -115,7 +115,12 @@ TURNING = planar(x - x**3 - 2 * y, 2 * x - y)
 
 @pytest.mark.parametrize("h", [(0.01, 0.01), (0.005, 0.08)], ids=["one step", "varying steps"])
 @pytest.mark.parametrize(
-    "known", [archetype(3), maier_stein(5), double_well(2)], ids=["archetype", "Maier-Stein", "double well"]
+    "known",
+    [
+        pytest.param(archetype(3), id="archetype"),
+        pytest.param(maier_stein(5), id="Maier-Stein", marks=pytest.mark.slow),
+        pytest.param(double_well(2), id="double well"),
+    ],
 )
 def test_pairs_without_noise_give_the_coefficients(known: KnownSystem, h: tuple[float, float]) -> None:
     found = identified(known, flow_pairs(known, 200, h=h))

@@ -224,6 +224,7 @@ def test_the_step_asks_the_likelihood_where_sensors_are_noisy() -> None:
     assert "measurement noise" in done.outcome.reason
 
 
+@pytest.mark.slow
 def test_a_sensor_is_found_where_steps_are_nearly_as_long_as_the_state_relaxes() -> None:
     # Neighbouring residuals are hardly correlated: a force that is too steep stands for the sensor's noise.
     values = double_wells(1, samples=150_000, traces=1, intensity=0.16, sensor=0.14)[:, ::30]

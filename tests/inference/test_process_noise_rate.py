@@ -122,7 +122,7 @@ def _forces(recordings: siq.Recordings, *, integrator_step: float | None = None)
     return with_process_noise_rate(found, pairs).noise_rate
 
 
-@pytest.mark.parametrize("parts", [1, 2, 40])
+@pytest.mark.parametrize("parts", [1, pytest.param(2, marks=pytest.mark.slow), 40])
 def test_steps_of_a_simulation_are_known_by_their_noise(parts: int) -> None:
     # dx = (x - x³) dt + √0.25 dW by Euler's rule, each step or second a sample; or as good as continuous.
     step, x, samples = 0.06, np.linspace(-1.5, 1.5, 200), []

@@ -89,8 +89,15 @@ def test_recordings_without_noise_have_none(known: KnownSystem, setup: str) -> N
 
 
 @pytest.mark.parametrize("setup", SETUPS)
-@pytest.mark.parametrize("intensity", [0.0, 0.01])
-@pytest.mark.parametrize("size", [0.01, 0.04])
+@pytest.mark.parametrize(
+    ("size", "intensity"),
+    [
+        (0.01, 0.0),
+        (0.01, 0.01),
+        (0.04, 0.0),
+        pytest.param(0.04, 0.01, marks=pytest.mark.slow),
+    ],
+)
 def test_measurement_noise_is_recognised_with_its_size(size: float, intensity: float, setup: str) -> None:
     recordings = with_errors(recorded(maier_stein(1), intensity=intensity, setup=setup), size)
     noise = diagnosed(recordings)

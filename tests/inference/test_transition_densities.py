@@ -176,7 +176,7 @@ def test_f_and_d_are_found_of_means_over_such_steps() -> None:
     assert found.diagnosis.measurement[0] == pytest.approx(0.1, rel=0.25)
 
 
-@pytest.mark.parametrize("noise", [0.1, 0.3])
+@pytest.mark.parametrize("noise", [0.1, pytest.param(0.3, marks=pytest.mark.slow)])
 def test_f_and_d_are_found_behind_a_sensor_over_such_steps(noise: float) -> None:
     """Without its noise D is 1.1 and 2 times as large. It is seen, f and D are right, all else is white."""
     pairs = behind_sensor(double_well(0.5, samples=20), noise)

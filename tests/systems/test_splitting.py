@@ -26,6 +26,7 @@ def height(place: np.ndarray) -> np.ndarray:
     return 8 * place[0]
 
 
+@pytest.mark.slow
 def test_a_time_in_one_state_is_that_of_quadrature_with_any_coordinate() -> None:
     dynamics, intensity, cores, exact = prepared(4.0)
     found = split_escapes(

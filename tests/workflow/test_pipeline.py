@@ -135,7 +135,7 @@ def test_the_same_seed_gives_the_same_and_another_run_another_answer(
 @pytest.mark.parametrize(
     ("training", "agrees"),
     [
-        pytest.param(CHECKED, True, id="with output weights"),
+        pytest.param(CHECKED, True, id="with output weights", marks=pytest.mark.slow),
         pytest.param(
             replace(CHECKED, thinning_distance=0.3),
             True,
