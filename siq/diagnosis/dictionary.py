@@ -251,7 +251,7 @@ def _unit_of(formula: str, units: tuple[tuple[str, str], ...]) -> str:
 
 FORMULA_TOLERANCE = 1e-9  # relative difference of values of formulas that are the same
 TRIAL_POINTS = 12
-SPEED = re.compile(r"([cdkmnuµμ]?m|m?rad|deg|°|rev|ft|in|1) ?/ ?([mnuµμ]?s|min|h)|rpm")  # units of speeds
+SPEED = re.compile(r"([cdkmnuµμ]?m|m?rad|deg|°|rev|ft|in) ?/ ?([mnuµμ]?s|min|h)|rpm|1 ?/ ?(s|min)")  # units
 ANYWHERE = (0.5, 1.5)  # where formulas of a state without a domain are compared, as those of inputs are
 
 
