@@ -182,8 +182,9 @@ def by_states(recordings: Recordings) -> _Climbed | None:
 def by_ladder(recordings: Recordings) -> _Climbed | None:
     """The answer of ``siq run``: residence times as f and D have them from rung 4 on, else the states' own.
 
-    What visits are foreseen to last (`siq.quasipotential.occupancy`) is another time: they end where the core
-    of another attractor begins, and true stays on its level.
+    These stand also where f and D tell no times, as those of a force that may be a gate. What visits are
+    foreseen to last (`siq.quasipotential.occupancy`) is another time: they end where the core of another
+    attractor begins, and true stays on its level.
     """
     try:
         found = Landscape.from_recordings(recordings)
@@ -192,6 +193,8 @@ def by_ladder(recordings: Recordings) -> _Climbed | None:
     if found.rung < 4:
         return by_states(recordings) if found.rung else None
     times = found.dwell_times()
+    if times["mean_time"].isna().any() and (seen := by_states(recordings)) is not None:
+        return seen._replace(rung=found.rung)
     order = np.argsort([one.position[0] for one in found.attractors])
     factor = np.exp(DEVIATIONS * np.hypot(times["data_error"], times["law_error"]))
     stays = np.stack([times["mean_time"], times["mean_time"] / factor, times["mean_time"] * factor], axis=1)
