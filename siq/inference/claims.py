@@ -46,9 +46,11 @@ import scipy.special
 
 from siq.data.preparation import joined, repetitions
 from siq.data.recordings import Recordings, SnapshotPairs, parent_recordings, snapshot_pairs
+from siq.data.stationarity import usual_step
 from siq.inference.checks import STATE_BINS, unexplained_probability
 from siq.inference.diffusion_model import process_noise_increments
 from siq.inference.field_estimate import FieldEstimate, Verdict
+from siq.inference.observation import ObservationModel
 from siq.inference.regression import coarse_pairs, residuals
 from siq.numerics.integration import machine_code
 from siq.numerics.randomness import positive
@@ -243,11 +245,12 @@ def _gaussian_force(found: FieldEstimate, states: Recordings, limit: float) -> V
 
     The fourth cumulant of n values with the correlations ρ_k has the variance ``24/n Σ_k ρ_k⁴`` where they
     are Gaussian (Isserlis). Of a gate it is -2, of which a filter that knows the share r of the variance
-    sees r².
+    sees r². What follows the state is taken off first: that is spread as the state is.
     """
     time, begins = -1 / found.values[-1], np.searchsorted(states.recording, states.recording)
-    known = states.t - states.t[begins] > FORGOTTEN * time
-    force = states.values[known, 1]
+    known, force = states.t - states.t[begins] > FORGOTTEN * time, states.values[:, 1]
+    observation, x, step = ObservationModel.of(found), states.values[:, 0], usual_step(states)
+    force = (force - observation.following(x, np.unique(begins)[1:], found.values, step))[known]
     if len(force) < FEWEST_PAIRS:
         return Verdict.not_tested(sentence(Remark("inference.recordings_too_short")))
     force, lasted = force - force.mean(), len(force) * float(np.median(np.diff(states.t)))

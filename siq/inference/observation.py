@@ -250,16 +250,21 @@ class ObservationModel:
             return self.noise(Noise(sensor, np.ones(len(rate)), field=found.noise.diffusion(1.0)))
         return self.noise(Noise.of_rate(sensor, rate))
 
+    def following(self, x: np.ndarray, begins: np.ndarray, values: np.ndarray, step: float) -> np.ndarray:
+        """The force that follows x ``(n,)`` without noise, from rest in each part; zero if none follows."""
+        if not self.follows:
+            return 0 * x
+        from scipy.signal import lfilter  # which brings all of scipy.stats, half a second to import
+
+        kept = float(np.exp(values[-1] * step))
+        parts = [lfilter([1 - kept], [1, -kept], one, zi=kept * one[:1])[0] for one in np.split(x, begins)]
+        return -values[-2] / values[-1] * np.concatenate(parts)
+
     def states(self, data: Measurements, values: np.ndarray | None = None) -> np.ndarray:
         """States of the model to begin with, as they are measured next; a force follows with coefficients."""
         if self.follows and values is not None:
-            from scipy.signal import lfilter  # which brings all of scipy.stats, half a second to import
-
-            x, (slope, rate) = data.outputs[:, 0], values[-2:]
-            kept = float(np.exp(rate * np.median(data.step[data.begins])))
-            parts = np.split(x, data.first[1:-1])
-            means = [lfilter([1 - kept], [1, -kept], one, zi=kept * one[:1])[0] for one in parts]
-            return np.column_stack([x, -slope / rate * np.concatenate(means)])
+            x, step = data.outputs[:, 0], float(np.median(data.step[data.begins]))
+            return np.column_stack([x, self.following(x, data.first[1:-1], values, step)])
         if self.slow_force or self.sensor_time is not None:
             return np.column_stack([data.outputs, np.zeros(len(data.t))])
         if self.hidden:

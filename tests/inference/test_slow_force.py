@@ -101,15 +101,29 @@ def test_it_is_not_sought_where_hidden_states_are_switched_off() -> None:
         ("gate", 1.0, False, True),
         ("gate", 0.6, False, True),
         ("noise", 0.1, False, False),
+        ("following", 1.0, True, True),
     ],
 )
 def test_a_gate_is_no_noise(kind: str, share: float, passed: bool, tested: bool) -> None:
-    """Of a force of unit variance a filter knows a share; what it does not know is left out of it."""
+    """Of a force of unit variance a filter knows a share; what it does not know is left out of it.
+
+    One that follows what hops is spread as that is, and by its noise beside.
+    """
     draw = np.random.default_rng(3)
     times = STEP * np.arange(COUNT)
-    force = relaxation(draw, COUNT, TIME, step=STEP) if kind == "noise" else telegraph(draw, times, 2 * TIME)
+    gate, noise = telegraph(draw, times, 2 * TIME), relaxation(draw, COUNT, TIME, step=STEP)
+    force = gate if kind == "gate" else noise
     known = share * force + np.sqrt(share * (1 - share)) * relaxation(draw, COUNT, TIME, step=STEP)
-    states = Recordings.from_arrays([times], [np.column_stack([force, known])], names=["x", "force_x"])
-    found: Any = SimpleNamespace(values=np.array([-1 / TIME]), noise_rate=2 / TIME * np.eye(2))
+    library = field_library(("x", "force_x"), IdentificationOptions(degree=1))
+    slope, coefficients = 5.0 / TIME * (kind == "following"), np.zeros((library.size, 2))
+    coefficients[library.terms.index(library.symbols[0]), 1] = slope
+    found: Any = SimpleNamespace(
+        values=np.array([slope, -1 / TIME]), noise_rate=2 / TIME * np.eye(2), library=library, slow_force=1.0,
+        coefficients=coefficients, diffusion=Diffusion.identity(2), hidden_states=True,
+        slow_sensor=None, diagnosis=None, exposure=None,
+    )  # fmt: skip
+    response = ObservationModel.of(found).following(gate, np.array([], int), found.values, STEP)
+    seen = np.column_stack([gate, known + response])
+    states = Recordings.from_arrays([times], [seen], names=["x", "force_x"])
     verdict = _gaussian_force(found, states, 1 / 160)
     assert (verdict.passed, verdict.tested) == (passed, tested)
