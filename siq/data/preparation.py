@@ -187,10 +187,8 @@ def in_stretches(recordings: Recordings, *, hidden_velocities: bool | Literal["a
 
     Stretches are ten correlation times long, hops included, where this makes between ten and forty of them.
     Of few recordings the one that is held out may be the only one to have been in a well. Ten and more come
-    back as they are; so do several where the cuts would cost a hundredth of the pairs, one of too few pairs,
-    and those without process noise: a system that settles once is not seen again in another stretch. With
-    hidden velocities they are positions, which are smooth in any case; whether there is noise is found
-    together with f.
+    back as they are; so do several where cuts would cost a hundredth of the pairs, and those without process
+    noise: what settles once does so in no other stretch. Positions whose velocities are hidden are smooth.
     """
     count, several = len(recordings.t), len(recordings.labels)
     if several >= FEWEST_STRETCHES or count < FEWEST_STRETCHES * (2 if several == 1 else 100):

@@ -535,9 +535,8 @@ def _fitted_at(
 
 def _gain_over(one: Sequence[Horizon], other: Sequence[Horizon]) -> float:
     """What fits at every horizon gain over others."""
-    pairs = zip(one, other, strict=True)
-    gains = [(a.log_density - b.log_density) / min(a.correlated, b.correlated) for a, b in pairs]
-    return float(np.mean(gains))
+    pairs = [(a.log_density - b.log_density, a, b) for a, b in zip(one, other, strict=True)]
+    return float(np.mean([gain / min(a.correlated, b.correlated) for gain, a, b in pairs]))
 
 
 def _next_rung(
@@ -776,9 +775,8 @@ def _exchanged(found: list[_Rung], alone: Sequence[Horizon], context: FitContext
                     break
                 rungs, horizons = [*rungs, above], above.horizons
             else:
-                gain = _gain_over(horizons, found[-1].horizons)
-                LOGGER.info("%s, for %s: gains %.1f", other.candidate.label, best.candidate.label, gain)
-                if gain > context.study.search.least_log_odds:
+                if _gain_over(horizons, found[-1].horizons) > context.study.search.least_log_odds:
+                    LOGGER.info("%s is exchanged for %s", best.candidate.label, other.candidate.label)
                     return rungs
     return found
 

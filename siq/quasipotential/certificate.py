@@ -182,14 +182,13 @@ def certify(
     if isinstance(formulas, SymbolicDecomposition):
         scope, symbols, d = "region", formulas.symbols, len(formulas.symbols)
         second = compile_formulas([one.diff(x) for one in formulas.gradient for x in symbols], symbols)
-        region = Candidate(
+        candidates = [Candidate(
             formulas.values, lambda x: formulas.evaluate_gradient(np.ascontiguousarray(x.T)).T,
             lambda x: second(np.ascontiguousarray(x.T)).T.reshape(-1, d, d),
             lambda x: formulas.evaluate(np.ascontiguousarray(x.T))[1 : d + 1].T,
             evidence.points, portrait.attractors, relative_error, evidence.pairs, evidence.references,
             tested_on=f"{len(evidence.points)} held-out states",
-        )  # fmt: skip
-        candidates = [region]
+        )]  # fmt: skip
     else:
         scope, candidates = "wells", [_candidate_in_well(well, evidence) for well in wells]
     verdicts: dict[str, list[Verdict]] = {}
