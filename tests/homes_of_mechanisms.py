@@ -101,6 +101,21 @@ def inflow(rng: np.random.Generator, t: np.ndarray, *, size: float = 1.0) -> np.
     return np.repeat(levels, 10)[None, : len(t)]
 
 
+def warmed(
+    rate: str, units: Mapping[str, str], begin: tuple[float, float], *, time: str = "s", size: float = 1.0,
+    **values: float,
+) -> Home:  # fmt: skip
+    """What an input u warms; it gives off a tenth of its heat in a unit of time, and s begins in a range."""
+    card = {
+        "time_unit": time,
+        "states": states(s=units["s"]),
+        "inputs": {"u": {"unit": units["u"], "interpolation": "zero_order"}},
+        "parameters": numbers(**values, h=0.1),
+        "equations": {"s": rate},
+    }
+    return Home(card, 0.5, lambda rng: rng.uniform(*begin, size=1), lambda rng, t: inflow(rng, t, size=size))
+
+
 HOMES: Mapping[str, Home] = {
     "mass": Home(
         {
@@ -615,54 +630,10 @@ HOMES: Mapping[str, Home] = {
         lambda rng: rng.uniform(0.1, 2.0, size=1),
         inflow,
     ),
-    "furnace": Home(
-        {
-            "time_unit": "s",
-            "states": states(s="K"),
-            "inputs": {"u": {"unit": "W", "interpolation": "zero_order"}},
-            "parameters": numbers(g=100.0, h=0.1),
-            "equations": {"s": "g*u - h*(s - 300)"},
-        },
-        0.5,
-        lambda rng: rng.uniform(300.0, 1000.0, size=1),
-        inflow,
-    ),
-    "kettle": Home(
-        {
-            "time_unit": "s",
-            "states": states(s="°C"),
-            "inputs": {"u": {"unit": "W", "interpolation": "zero_order"}},
-            "parameters": numbers(g=20.0, h=0.1),
-            "equations": {"s": "g*u - h*s"},
-        },
-        0.5,
-        lambda rng: rng.uniform(20.0, 300.0, size=1),
-        inflow,
-    ),
-    "pond": Home(
-        {
-            "time_unit": "h",
-            "states": states(s="°C"),
-            "inputs": {"u": {"unit": "kW", "interpolation": "zero_order"}},
-            "parameters": numbers(g=2.0, h=0.1),
-            "equations": {"s": "g*u - h*(s - 15)"},
-        },
-        0.5,
-        lambda rng: rng.uniform(20.0, 80.0, size=1),
-        inflow,
-    ),
-    "hut": Home(
-        {
-            "time_unit": "h",
-            "states": states(s="K"),
-            "inputs": {"u": {"unit": "K", "interpolation": "zero_order"}},
-            "parameters": numbers(g=3.0, h=0.1),
-            "equations": {"s": "g - h*s"},
-        },
-        0.5,
-        lambda rng: rng.uniform(20.0, 80.0, size=1),
-        lambda rng, t: inflow(rng, t, size=20.0),
-    ),
+    "furnace": warmed("g*u - h*(s - 300)", {"s": "K", "u": "W"}, (300.0, 1000.0), g=100.0),
+    "kettle": warmed("g*u - h*s", {"s": "°C", "u": "W"}, (20.0, 300.0), g=20.0),
+    "pond": warmed("g*u - h*(s - 15)", {"s": "°C", "u": "kW"}, (20.0, 80.0), time="h", g=2.0),
+    "hut": warmed("g - h*s", {"s": "K", "u": "K"}, (20.0, 80.0), time="h", size=20.0, g=3.0),
     "lamp": Home(
         {
             "time_unit": "s",

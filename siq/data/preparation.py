@@ -43,7 +43,7 @@ ANGLES = ("data.wrapped_angle", "data.unwrapped_angle")  # codes of remarks on c
 # Choices: turns that show f to be the same in each; probabilities that f has no such period, and that it has.
 FEWEST_TURNS, OF_A_TURN, NOT_OF_A_TURN = 3, 1e-6, 0.01
 ENDS_OF_TURN = 0.05  # of a turn, within which a column that jumps by one comes to 0 and 1 of it, or to ±½
-FEWEST_STRETCHES = 10  # of a single recording, at least, two of which are held out
+FEWEST_STRETCHES = 10  # of few recordings together, at least, two of which are held out
 MOST_STRETCHES = 40  # more make no error better known
 STRETCH_LENGTH = 10  # correlation times: what is left of its first sample at its end is then nothing
 BLOCK = 200  # steps, whose median says how large steps are thereabouts
@@ -187,8 +187,8 @@ def in_stretches(recordings: Recordings, *, hidden_velocities: bool | Literal["a
 
     Stretches are ten correlation times long, hops included, where this makes between ten and forty of them.
     Of few recordings the one that is held out may be the only one to have been in a well. Ten and more come
-    back as they are; so do several where cuts would cost a hundredth of the pairs, and those without process
-    noise: what settles once does so in no other stretch. Positions whose velocities are hidden are smooth.
+    back as they are; so do several of fewer than 1,000 samples, of whose pairs ten cuts cost a hundredth, and
+    those without noise, as what settles once does so in no other stretch, unless velocities are hidden.
     """
     count, several = len(recordings.t), len(recordings.labels)
     if several >= FEWEST_STRETCHES or count < FEWEST_STRETCHES * (2 if several == 1 else 100):
