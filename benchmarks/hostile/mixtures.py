@@ -64,12 +64,12 @@ def gains(draw: np.random.Generator, strength: float, copies: int) -> Record:
 
 @kind("one_system")
 def baselines(draw: np.random.Generator, strength: float, copies: int) -> Record:
-    """A double well in recordings that have a baseline each."""
+    """A double well in recordings that have a baseline each, which is taken off: the law is that without."""
     scene = Scene.drawn(draw, recordings=(4, 8))
     level = 0.7 * strength * draw.standard_normal(scene.recordings)
     paths = double_wells(draw, scene, copies)
     moved = [path + level[place % len(level)] for place, path in enumerate(paths)]
-    return Record.sampled(scene, moved, law=Law.of(scene) if strength == 0 else None)
+    return Record.sampled(scene, moved, law=Law.of(scene))
 
 
 def _by_recording(draw: np.random.Generator, strength: float, copies: int, what: str, size: float) -> Record:

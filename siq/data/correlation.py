@@ -183,9 +183,11 @@ class _Increments(NamedTuple):
             further = (carried**2).sum(axis=1) * run / seen.size / positive(size**2)
             error = np.sqrt(errors[one - 1] ** 2 + further)
             limit = STANDARD_ERRORS if place == 0 else STANDARD_ERRORS_LATER
-            if (np.abs(values[one - 1]) > limit * error).any():
-                return False
-            if (STANDARD_ERRORS * error > UNSEEN_CORRELATION).any():
+            apart, unseen = (
+                np.abs(values[one - 1]) > limit * error,
+                STANDARD_ERRORS * error > UNSEEN_CORRELATION,
+            )
+            if (apart | unseen).any():
                 return False
         return True
 

@@ -198,8 +198,7 @@ def _levels_of(
     from deeptime.markov.msm import MarkovStateModel
 
     states, scale = len(centre), max(float(series.std()), 1e-300)
-    shift = float(series.mean())
-    near = np.abs(series[:, None] - centre).argmin(axis=1)
+    shift, near = float(series.mean()), np.abs(series[:, None] - centre).argmin(axis=1)
     spread = [
         max(float(series[near == k].std() if (near == k).any() else 0.0), 1e-2 * scale) for k in range(states)
     ]
@@ -251,14 +250,12 @@ def path_of(
         Levels are nearly all that neighbouring samples share: then one of so many samples was looked at,
         behind a filter more than 1, and stands for them. It is 0 where there are none.
     """
-    series = values[:, column]
-    width = max(int(AVERAGING_TIME * relaxation), 1)
+    series, width = values[:, column], max(int(AVERAGING_TIME * relaxation), 1)
     smooth = np.empty_like(values)
     for run in runs:
         smooth[run] = ndimage.uniform_filter1d(values[run], width, axis=0, mode="nearest")
     # Values of a counter or a digitiser have no nearest neighbours.
-    steps = np.array([resolution_step(one) or 0.0 for one in values.T])
-    draw = np.random.default_rng(0)
+    steps, draw = np.array([resolution_step(one) or 0.0 for one in values.T]), np.random.default_rng(0)
     some, longest = runs[:: -(-len(runs) // MOST_RUNS)], []  # how long visits to a place are remembered
     for one in smooth.T:
         bins = np.searchsorted(np.quantile(one, np.arange(0.1, 1.0, 0.1)), one)
@@ -427,8 +424,7 @@ def _memoryless(path: np.ndarray, runs: list[slice], states: int, dead: int) -> 
         seen = np.arange(len(turns)) < len(turns) - 1
         np.add.at(exits, (visited[seen], lengths[seen]), 1)
         np.add.at(risk, (visited, lengths - ~seen), 1)
-    risk = np.cumsum(risk[:, ::-1], axis=1)[:, ::-1]
-    age = np.log(np.arange(1, longest - dead))
+    risk, age = np.cumsum(risk[:, ::-1], axis=1)[:, ::-1], np.log(np.arange(1, longest - dead))
     for state, (ended, under) in enumerate(zip(exits[:, dead + 1 :], risk[:, dead + 1 :], strict=True)):
         if not ended.sum() or not len(age):
             continue
@@ -497,8 +493,7 @@ class MarkovModel(NamedTuple):
             # Rows of the transition matrix have Dirichlet's distribution; the prior is no hop at all.
             drawn = np.random.default_rng(0).standard_gamma(own, size=(DRAWS, states, states))
             drawn /= drawn.sum(axis=2, keepdims=True)
-            usual = own / own.sum(axis=1, keepdims=True)
-            worst = 0.0
+            usual, worst = own / own.sum(axis=1, keepdims=True), 0.0
             # Beyond the time that visits last: before, hardly anything hops, and any model passes.
             multiples = 2 ** np.arange(1, int(np.log2(max(FORGOTTEN_STAYS * max(stays) / lag, 2))) + 1)
             for multiple in multiples:
@@ -506,8 +501,7 @@ class MarkovModel(NamedTuple):
                 visits = later.sum(axis=1, keepdims=True)
                 if (visits < 1).any():
                     continue
-                seen = later / visits
-                expected = np.linalg.matrix_power(usual, int(multiple))
+                seen, expected = later / visits, np.linalg.matrix_power(usual, int(multiple))
                 spread = np.linalg.matrix_power(drawn, int(multiple)).var(axis=0)
                 spread += expected * (1 - expected) / visits
                 off = np.abs(seen - expected) / np.sqrt(np.maximum(spread, 1e-12))

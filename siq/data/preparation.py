@@ -137,11 +137,8 @@ def turns_back(recordings: Recordings) -> bool:
         return False
     x = recordings.values[:, 0]
     low, high = x.min() + np.ptp(x) * np.array([1 / 3, 2 / 3])
-    for run in runs_of(joined(recordings)):
-        side = np.where(x[run] > high, 1, np.where(x[run] < low, -1, 0))
-        if (np.diff(side[side != 0]) != 0).sum() > 1:
-            return True
-    return False
+    sides = (np.sign((x[run] > high) - 1.0 * (x[run] < low)) for run in runs_of(joined(recordings)))
+    return any((np.diff(side[side != 0]) != 0).sum() > 1 for side in sides)
 
 
 def unusual(recordings: Recordings) -> list[Remark]:
@@ -622,8 +619,7 @@ def repetitions(recordings: Recordings, column: int) -> list[tuple[float, str, f
         spread = np.sqrt(np.bincount(part, changes**2) / np.bincount(part))
         spread = np.maximum(spread, max(LEAST_SPREAD * float(spread.max()), 1e-300))
         sizes = np.abs(changes)
-        count = int((sizes < ALIKE * size).sum())
-        share = float(widths.mean()) / width
+        count, share = int((sizes < ALIKE * size).sum()), float(widths.mean()) / width
         usual = len(changes) * min(share * width / np.sqrt(2 * np.pi) * float((1 / spread).mean()), 1.0)
         # As many are zero as any other small number of steps; a line that is rounded is bent by one or two.
         most = int(SMALL_CHANGE * spread.min() / width)

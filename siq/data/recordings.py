@@ -404,8 +404,12 @@ class SnapshotPairs:
 
     def equal_parts(self, parts: int, *, of_steps: bool = False) -> np.ndarray:
         """Whether pairs are in each but the first of so many parts of states, or steps: ``(n, columns)``."""
-        sorted_by = [np.round(self.h / np.median(self.h), 2)] if of_steps else self.x0.T
-        return np.concatenate([_in_parts(each, parts) for each in sorted_by], axis=1)
+        found, shares = [], np.linspace(0, 1, parts + 1)[1:-1]
+        for each in [np.round(self.h / np.median(self.h), 2)] if of_steps else self.x0.T:
+            edges = np.unique(np.quantile(each, shares))
+            part = np.searchsorted(edges, each, side="right")
+            found.append(part[:, None] == np.arange(1, len(edges) + 1))
+        return np.concatenate(found, axis=1)
 
     def take(self, rows: np.ndarray | slice) -> SnapshotPairs:
         """Some of the pairs, by their indices or by a mask."""
@@ -421,11 +425,6 @@ def _longest(steps: np.ndarray) -> float:
         if not longer - np.sqrt(longer) >= max(UNEVEN_SHARE * len(steps), 1):  # of few steps one may be a gap
             return longest
         longest *= 2
-
-
-def _in_parts(values: np.ndarray, parts: int) -> np.ndarray:
-    edges = np.unique(np.quantile(values, np.linspace(0, 1, parts + 1)[1:-1]))
-    return np.asarray(np.searchsorted(edges, values, side="right")[:, None] == np.arange(1, len(edges) + 1))
 
 
 class StreamedPairs:

@@ -27,7 +27,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import product
+from itertools import pairwise, product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -38,6 +38,7 @@ from siq.data.correlation import FEWEST_VALUES, markov_lag, resolution_step
 from siq.data.kinetics import CONFIDENCE, FALSE_WELL, MarkovModel, Profile, exponential, path_of, stays_of
 from siq.data.recordings import Recordings
 from siq.data.stationarity import (
+    SHORTEST_STRETCH,
     background_of,
     change_of,
     correlated_samples,
@@ -283,7 +284,7 @@ def _histogram(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
 
 SIGNIFICANCE = 0.01  # probability with which a single state is taken for several
 DECISIVE_P = 1e-5  # probability for the first test from which on the second one is not asked
-MOST_PASSES = 5  # over states and background, each in turn
+MOST_PASSES = 10  # over states and background, each in turn
 SETTLED_BACKGROUND = 0.01  # of the spread of a state
 FALSE_OFFSET_RATE = 1e-3  # probability with which recordings with one baseline are given one each
 LAGS_COMPARED, MOST_COMPARED = 8, 100_000  # up to the relaxation time; samples
@@ -469,10 +470,12 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
     if not relaxations:
         return None
     tried, recorded = list(relaxations), recordings.values
-    # Each as it is, and less what a drift in one direction would have moved it by: hops may hide that.
+    # Less baselines, and less what a drift in one direction would have moved it by: hops may hide that.
     drifts = np.zeros((2, *recorded.shape))
-    for place in tried:
-        drifts[1, :, place] = background_of(recordings, recorded[:, place], functions=1)
+    for place, time in relaxations.items():
+        one = recorded[:, [place]]
+        drifts[:, :, [place]] = _baselines(recordings, one, one, int(np.ceil(time / 2)))
+        drifts[1, :, place] += background_of(recordings, recorded[:, place], functions=1)
     apart = np.array(
         [
             [
@@ -487,7 +490,7 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
     rarest, rarities, depths = 1.0, np.ones(len(tried)), np.zeros(len(tried))
     if chance >= DECISIVE_P:
         rarest, rarities, depths = _valleys(
-            recordings.values[:, tried], runs, list(relaxations.values()), generator=generator
+            (recorded - drifts[0])[:, tried], runs, list(relaxations.values()), generator=generator
         )
     kinds = 2 if apart[..., 0].any() else 1  # too few stretches make no test of the first kind
     probability = min(kinds * min(chance, rarest), 1.0)
@@ -508,7 +511,7 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
         places, path, expected, wells, levels = path_of(flat, runs, relaxation, column=column)
         level = np.where(path[:, None] >= 0, places[path], np.median(flat, axis=0))
         slow = np.array([background_of(recordings, one) for one in (values - level).T]).T
-        baseline = _baselines(recordings, values - level - slow)
+        baseline = _baselines(recordings, values - slow, values - level - slow, int(np.ceil(relaxation / 2)))
         moved = slow + baseline - background
         background = slow + baseline
         if (np.abs(moved).max(axis=0) <= SETTLED_BACKGROUND * (values - level).std(axis=0)).all():
@@ -593,8 +596,7 @@ def _crossed_as_often(values: np.ndarray, levels: np.ndarray, runs: list[slice],
     levels, lags = np.sort(levels), np.unique(np.geomspace(1, max(relaxation, 1), LAGS_COMPARED).astype(int))
     below = [np.mean(values <= one) for one in (levels[1:] + levels[:-1]) / 2]
     places = special.ndtri(np.clip(below, 1 / len(values), 1 - 1 / len(values)))[:, None]
-    parts = [scores[None, run] for run in runs if run.start < len(values)]
-    counts = []
+    parts, counts = [scores[None, run] for run in runs if run.start < len(values)], []
     for series in _surrogates(parts, FEWEST_SURROGATES, generator=draw):
         above = series > places
         counts.append(np.concatenate([(above[:, lag:] != above[:, :-lag]).sum(axis=1) for lag in lags]))
@@ -603,19 +605,61 @@ def _crossed_as_often(values: np.ndarray, levels: np.ndarray, runs: list[slice],
     return float(np.mean(largest[1:] >= largest[0]))
 
 
-def _baselines(recordings: Recordings, rest: np.ndarray) -> np.ndarray:
-    """What recordings differ by in the mean of what states leave, ``(n, d)``; zero where by chance alone."""
-    labels, number = recordings.recording, len(recordings.labels)
-    found = np.zeros_like(rest)
+def _baselines(recordings: Recordings, values: np.ndarray, rest: np.ndarray, lag: int) -> np.ndarray:
+    """What recordings differ by, ``(n, d)``; zero where they do by chance alone.
+
+    Told by the mean of ``rest``, which states leave of ``values``, or by steps over ``lag`` samples, the mean
+    of which is one function of what a baseline leaves of ``values``: then it does not count how long a
+    recording stays near the tops between states. Whichever has the smaller errors counts.
+    """
+    labels, number, found = recordings.recording, len(recordings.labels), np.zeros_like(rest)
     if number < 2:
         return found
-    counts, runs = np.bincount(labels, minlength=number), runs_of(recordings, bridged=True)
-    for place, one in enumerate(rest.T):
-        means = np.bincount(labels, weights=one, minlength=number) / np.maximum(counts, 1)
-        inside = one - means[labels]
-        error = inside.var() * 2 * correlated_samples(inside, runs) / np.maximum(counts, 1)
-        centre = np.average(means, weights=counts)
-        squares = float((((means - centre) ** 2)[counts > 0] / np.maximum(error[counts > 0], 1e-300)).sum())
-        if special.chdtrc((counts > 0).sum() - 1, squares) < FALSE_OFFSET_RATE:
-            found[:, place] = (means - centre)[labels]
+    whole, apart = runs_of(recordings, bridged=True), 1 + len(labels) // MOST_COMPARED
+    starts = [np.arange(run.start, run.stop - lag, apart) for run in whole]
+    begins, ends = np.concatenate(starts), np.cumsum([0, *map(len, starts)])
+    counts, which = np.bincount(labels, minlength=number), labels[begins]
+    told_by_steps = np.bincount(which, minlength=number)[counts > 0].min() > SHORTEST_STRETCH
+    chosen = sparse.eye_array(number, format="csr")[which]
+    runs = [slice(*one) for one in pairwise(ends) if one[0] < one[1]]
+    centred = np.eye(number) - counts / positive(counts.sum())
+    for place, series in enumerate(values.T):
+        steps, of_states = series[begins + lag] - series[begins], rest[:, place]
+        means = [np.bincount(labels, one, number) / np.maximum(counts, 1) for one in (of_states, series)]
+        inside = of_states - means[0][labels]
+        error = inside.var() * 2 * correlated_samples(inside, whole) / np.maximum(counts, 1)
+        least, told = np.inf, [(centred @ means[0], centred @ np.diag(error) @ centred.T)]
+        # States may be taken for each other: the search begins at no baselines, and at all means, too.
+        for offsets in (np.zeros(number), *means) if told_by_steps else ():
+            for _ in range(MOST_PASSES):
+                x = series[begins] - offsets[which]
+                x = (2 * x - x.max() - x.min()) / (scale := positive(np.ptp(x)))
+                basis = np.polynomial.legendre.legvander(x, max(DEGREES))
+                squares, of_mean = basis.T @ basis, basis.T @ steps
+                slope = -2 / scale * np.polynomial.Legendre(np.linalg.lstsq(squares, of_mean)[0]).deriv()(x)
+                mixed = chosen.T @ (slope[:, None] * basis)
+                normal = np.block([[squares, mixed.T], [mixed, np.diag(chosen.T @ slope**2)]])
+                inverse = np.linalg.pinv(normal, hermitian=True)
+                mean, moved = np.split(inverse @ [*of_mean, *(chosen.T @ (slope * steps))], [len(squares)])
+                offsets = centred @ (offsets + moved)
+                if np.abs(centred @ moved).max() <= SETTLED_BACKGROUND * series.std():
+                    break
+            error = steps - basis @ mean - slope * moved[which]
+            gained = (
+                len(error) / (2 * correlated_samples(error, runs)) * np.log(least / positive(error.var()))
+            )
+            # Recordings that are moved apart share no steps that could tell.
+            if (
+                gained <= 2 * np.log(1 / FALSE_OFFSET_RATE)
+                or (series - offsets[labels]).var() > 2 * series.var()
+            ):
+                continue
+            least, score = error.var(), slope * error
+            spread = score.var() / positive(np.mean(slope**2)) * 2 * correlated_samples(score, runs)
+            covariance = spread * centred @ inverse[len(squares) :, len(squares) :] @ centred.T
+            told[1:] = [(offsets, covariance)]
+        offsets, covariance = min(told, key=lambda one: float(np.trace(one[1])))
+        chi_squared = offsets @ np.linalg.pinv(covariance, hermitian=True) @ offsets
+        if special.chdtrc((counts > 0).sum() - 1, chi_squared) < FALSE_OFFSET_RATE:
+            found[:, place] = offsets[labels]
     return found

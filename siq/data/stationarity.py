@@ -132,8 +132,7 @@ def correlated_samples(values: np.ndarray, runs: list[slice]) -> float:
     monotone sequence). Recordings share their mean; gaps between samples are passed over.
     """
     longest = max(run.stop - run.start for run in runs)
-    width = 1 << int(2 * longest - 1).bit_length()
-    centred = values - values.mean()
+    width, centred = 1 << int(2 * longest - 1).bit_length(), values - values.mean()
     power, counts = np.zeros(width // 2 + 1), np.zeros(longest)
     for run in runs:
         size = run.stop - run.start
@@ -308,8 +307,7 @@ def same_stretch(number: np.ndarray, lag: int) -> np.ndarray:
 
 def even_stretches(recordings: Recordings) -> Stretches:
     """Cut recordings into stretches of even steps, or where most are uneven, of all without gaps."""
-    gap = np.diff(recordings.t)
-    inside = np.diff(recordings.recording) == 0
+    gap, inside = np.diff(recordings.t), np.diff(recordings.recording) == 0
     if not inside.any():
         return Stretches(np.full(len(gap), -1), 0.0)
     usual = usual_step(recordings)

@@ -92,8 +92,7 @@ def _checked(
     if columns is None:
         source = _stacked(source)
     layout = layout_of(file, source, columns)
-    source = layout.source
-    used = [layout.time, *layout.states]
+    source, used = layout.source, [layout.time, *layout.states]
     cells = source.load([*([] if layout.recording is None else [layout.recording]), *used])
     labels = cells.pop(0) if layout.recording is not None else None
     if len(cells[0]) == 0:
@@ -515,8 +514,7 @@ def _in_order(rows: _Rows, numbers: np.ndarray, labelled: bool, remarks: list[Re
     bounds = np.searchsorted(rows.recording, np.arange(1, len(rows.labels)))
     parts, labels, was_sorted, twice, begun = [], [], 0, 0, 0
     for label, own in zip(rows.labels, np.split(rows.order, bounds), strict=True):
-        pieces = [own]
-        back = np.flatnonzero(np.diff(t[own]) < 0) + 1
+        pieces, back = [own], np.flatnonzero(np.diff(t[own]) < 0) + 1
         if len(back) >= 3 and len(back) > SHUFFLED_SHARE * (len(own) - 1):
             order = own[np.argsort(t[own], kind="stable")]
             if (np.diff(t[_once(order, numbers)]) > 0).all():

@@ -292,8 +292,7 @@ def filter_recursion(
                     for j in range(dimension):
                         value += transition[k, i, j] * slopes[c, j]
                     gain[i] = value
-                for i in range(dimension):
-                    slopes[c, i] = gain[i]
+                slopes[c] = gain
                 _carry(transition[k], bends[c], half)
                 if c < count:
                     m, n = places[c, 0], places[c, 1]
@@ -400,9 +399,7 @@ def _eliminate(products: np.ndarray, kept: int) -> tuple[int, float]:
     Only the lower triangle is used. A column of which nothing is left of its own is passed over.
     """
     width = len(products)
-    scale = np.empty(width)
-    for c in range(width):
-        scale[c] = products[c, c]
+    scale = np.diag(products).copy()
     removed = 0
     logarithm = 0.0
     for c in range(width - 1, kept - 1, -1):

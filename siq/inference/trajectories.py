@@ -49,8 +49,7 @@ def _run_tape(
         last = interval + first[recording + 1] - first[recording] - 1
         now = begin[recording].copy()
         row = first[recording]
-        for i in range(dimension):
-            states[row, i] = now[i]
+        states[row] = now
         alive = True
         while interval < last and alive:
             h = step[interval]
@@ -118,8 +117,7 @@ def _run_tape(
             interval += 1
             row += 1
             if alive:
-                for i in range(dimension):
-                    states[row, i] = now[i]
+                states[row] = now
         interval = last
 
 

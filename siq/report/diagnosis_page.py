@@ -158,11 +158,11 @@ def sentences_of(statement: Statement) -> dict[str, Any]:
 
 def _changes(recalibration: Mapping[str, Recalibrated]) -> list[tuple[str, Recalibrated, float]]:
     """Parameters that differ from those on the card, with how many standard errors; the surest first."""
-    found = []
-    for name, each in recalibration.items():
-        change, error = abs(each.after - each.before), each.standard_error
-        if change:
-            found.append((name, each, change / error if error > 0 else float("inf")))
+    sizes = (
+        (name, each, abs(each.after - each.before), each.standard_error)
+        for name, each in recalibration.items()
+    )
+    found = [(name, each, size / error if error > 0 else np.inf) for name, each, size, error in sizes if size]
     return sorted(found, key=lambda each: -each[2])
 
 

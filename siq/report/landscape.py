@@ -136,8 +136,7 @@ def _wells_table(summary: LandscapeSummary) -> tuple[pd.DataFrame, pd.DataFrame]
             cells["share of the domain" if summary.given else "recorded states"] = f"{100 * well.basin:.0f} %"
         for name, text in cells.items():
             rows.setdefault(name, []).append(text)
-    kept = {name: row for name, row in rows.items() if any(row)}
-    names = [well.label for well in wells]
+    kept, names = {name: row for name, row in rows.items() if any(row)}, [well.label for well in wells]
     if len(names) > MOST_COLUMNS:  # as many columns would be too wide: a row for each
         table = pd.DataFrame({"stable state": names} | kept)
     else:
@@ -186,21 +185,17 @@ def _place(summary: LandscapeSummary, position: np.ndarray) -> str:
 def _cycles_table(summary: LandscapeSummary) -> pd.DataFrame:
     rows = []
     for one in summary.unstable_cycles:
-        reach = [
-            range_text(*ends) for ends in zip(one.points.min(axis=0), one.points.max(axis=0), strict=True)
-        ]
-        rows.append(
-            dict(zip(summary.names, reach, strict=True))
-            | {with_unit("period", summary.time_unit): value_text(one.period, digits=4)}
-            | {"Floquet multipliers": ", ".join(map(_complex_text, one.multipliers.tolist()))}
+        row = dict(
+            zip(summary.names, map(range_text, one.points.min(axis=0), one.points.max(axis=0)), strict=True)
         )
+        row[with_unit("period", summary.time_unit)] = value_text(one.period, digits=4)
+        rows.append(row | {"Floquet multipliers": ", ".join(map(_complex_text, one.multipliers.tolist()))})
     return pd.DataFrame(rows)
 
 
 def _equilibria_table(summary: LandscapeSummary) -> pd.DataFrame:
     kinds = texts("tables")["equilibria"]
-    time = unit_text(summary.time_unit)
-    names = [with_unit(name, "1") for name in summary.names]
+    time, names = unit_text(summary.time_unit), [with_unit(name, "1") for name in summary.names]
     position = f"({', '.join(names)})" if len(names) > 1 else names[0]
     if len(set(summary.units)) == 1:
         position = with_unit(position, summary.units[0])
@@ -332,8 +327,7 @@ def _report(landscape: Landscape) -> tuple[list[str], list[tuple[str, pd.DataFra
     if written:
         stated = summary.stating(certificate)
         verdict = paragraphs("certificate.j2", certificate=stated, texts=texts("certificate"))[-1]
-    words = texts("tables")
-    found = landscape_tables(summary)
+    words, found = texts("tables"), landscape_tables(summary)
     wells, checked = found["wells"][0], found["checked"][0]
     tables = [] if wells.empty else [(words["wells"], wells)]
     if landscape.transitions:

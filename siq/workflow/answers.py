@@ -96,14 +96,6 @@ def _paths(named: Mapping[str, Any]) -> list[Path]:
     return [Path(path) for paths in several for path in paths if path]
 
 
-def _versions() -> dict[str, str]:
-    """The programs that take part, where they are loaded."""
-    from importlib.metadata import version as installed
-
-    loaded = {name: installed(name) for name in PROGRAMS if name in sys.modules or name == "snakemake"}
-    return {"siq": version(), "python": platform.python_version()} | loaded
-
-
 class Provenance:
     """What every file of a folder of results came from.
 
@@ -162,12 +154,15 @@ class Provenance:
             path.with_suffix(".csv") for path in made
             if path.suffix == ".parquet" and path.with_suffix(".csv").is_file()
         ]  # fmt: skip
+        from importlib.metadata import version as installed
+
+        loaded = {name: installed(name) for name in PROGRAMS if name in sys.modules or name == "snakemake"}
         line = {
             "task": task,
             **{key: said[key] for key in ("seed", "study", "command", "version") if key in said},
             "inputs": {self._own(path): Provenance.digest_of(path) for path in _paths(inputs)},
             "outputs": {self._own(path): Provenance.digest_of(path) for path in made},
-            "versions": _versions(),
+            "versions": {"siq": version(), "python": platform.python_version()} | loaded,
             "machine": f"{platform.system()} {platform.release()} {platform.machine()}",
             "ended": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         }

@@ -261,45 +261,9 @@ def _curve_rows(curves: Sequence[Branch]) -> list[dict[str, object]]:
     ]
 
 
-def _well_rows(point: SweptPoint, number: Sequence[int], noise: float | None) -> list[dict[str, object]]:
-    """One row for every well of a point; one that says why where there is none."""
-    if not point.wells:
-        return [_place(point) | {"well": -1, "noise": noise, "note": point.reason or "; ".join(point.notes)}]
-    weights = _weights(point, noise)
-    return [
-        _place(point)
-        | {"well": number[index], "attractor": _position_text(well.state), "relaxation": well.relaxation}
-        | _exits(point, index, number, noise)
-        | {"noise": noise, "weight": weights[index]}
-        for index, well in enumerate(point.wells)
-    ]
-
-
-def _way_rows(point: SweptPoint, number: Sequence[int]) -> list[dict[str, object]]:
-    """One row for every way out of a well of a point."""
-    return [
-        _place(point)
-        | {
-            "well": number[way.start],
-            "exit": None if way.end is None else number[way.end],
-            "barrier": way.barrier,
-            "prefactor": way.prefactor,
-            "relaxation": point.wells[way.start].relaxation,
-            "note": way.note,
-        }
-        for way in point.ways
-    ]
-
-
-def _place(point: SweptPoint) -> dict[str, object]:
-    first, second = (*point.values, np.nan)[:2]
-    return {"value": first, "second_value": second}
-
-
 def _weights(point: SweptPoint, noise: float | None) -> np.ndarray:
     """Shares of time in the long run; NaN where a rate is not known, or the noise is not below a barrier."""
-    count = len(point.wells)
-    between = [way for way in point.ways if way.end is not None]
+    count, between = len(point.wells), [way for way in point.ways if way.end is not None]
     known = noise is not None and all(way.barrier is not None and noise < way.barrier for way in between)
     # What leads elsewhere has a share of the time, too.
     if noise is None or not known or point.settled < 1 - UNSETTLED:
@@ -493,8 +457,31 @@ def collected(
     notes = tuple(dict.fromkeys(map(sentence, remarks)))
     rows, ways = [], []
     for point, number in zip(points, numbers, strict=True):
-        rows += _well_rows(point, number, noise)
-        ways += _way_rows(point, number)
+        first, second = (*point.values, np.nan)[:2]
+        place: dict[str, object] = {"value": first, "second_value": second}
+        if not point.wells:
+            note = point.reason or "; ".join(point.notes)
+            rows.append(place | {"well": -1, "noise": noise, "note": note})
+        weights = _weights(point, noise)
+        rows += [
+            place
+            | {"well": number[index], "attractor": _position_text(well.state), "relaxation": well.relaxation}
+            | _exits(point, index, number, noise)
+            | {"noise": noise, "weight": weights[index]}
+            for index, well in enumerate(point.wells)
+        ]
+        ways += [
+            place
+            | {
+                "well": number[way.start],
+                "exit": None if way.end is None else number[way.end],
+                "barrier": way.barrier,
+                "prefactor": way.prefactor,
+                "relaxation": point.wells[way.start].relaxation,
+                "note": way.note,
+            }
+            for way in point.ways
+        ]
     units = dict(zip(system.states, system.units, strict=True)) | {"t": system.time_unit}
     units |= {each.name: each.unit for each in system.parameters if each.name in names}
     found = [

@@ -215,6 +215,26 @@ def test_baselines_that_differ_are_given_one_each() -> None:
     assert without_background(recordings) is recordings
 
 
+def test_baselines_are_told_by_steps_where_recordings_hop_seldom_and_stay_near_the_top() -> None:
+    generator = np.random.default_rng(3)
+    number, length, step = 5, 4000, 0.02
+    offsets = 60 * generator.standard_normal(number)
+    x = np.empty((length, number))
+    now = generator.choice([-1.0, 1.0], number)
+    for place in range(length):
+        x[place] = 150 * now + offsets
+        for _ in range(4):
+            kick = np.sqrt(2 * 0.7 * step / 4) * generator.standard_normal(number)
+            now = now + 4 * (now - now**3) * step / 4 + kick
+    found = switching(Recordings.from_arrays(step * np.arange(length), x.T[:, :, None], names=["x"]))
+    assert found is not None and found.supported
+    told = found.baseline.reshape(number, length)[:, 0]
+    # What a recording spends in each well, and near the top, would move its mean by ten and more.
+    np.testing.assert_allclose(
+        told, offsets - offsets.mean(), atol=3.5 * 150 / np.sqrt(4**2 * step * length / 1.4)
+    )
+
+
 def test_an_inspection_tells_the_rungs() -> None:
     path = chain(0, RATES, 6000)
     found = inspect(recorded(path + 0.1 * noise(0, len(path))))

@@ -151,13 +151,11 @@ def _draw_branches(axes: Axes, branches: pd.DataFrame, bifurcations: pd.DataFram
 
 
 def _handles(table: pd.DataFrame, branches: pd.DataFrame, bifurcations: pd.DataFrame) -> list[Line2D]:
-    wells = sorted({int(well) for well in table["well"] if well >= 0})
-    handles = []
-    for well in wells:
-        colour, style, marker = look(well)
-        handles.append(
-            Line2D([], [], color=colour, marker=marker, linestyle=style, markersize=3, label=well_name(well))
-        )
+    handles = [
+        Line2D([], [], color=colour, marker=marker, linestyle=style, markersize=3, label=well_name(well))
+        for well in sorted({int(well) for well in table["well"] if well >= 0})
+        for colour, style, marker in [look(well)]
+    ]
     if (branches["well"] < 0).any():
         handles.append(Line2D([], [], color=GREY, linestyle="--", linewidth=0.8, label="unstable"))
     handles += [
