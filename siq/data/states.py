@@ -284,7 +284,7 @@ def _histogram(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
 
 SIGNIFICANCE = 0.01  # probability with which a single state is taken for several
 DECISIVE_P = 1e-5  # probability for the first test from which on the second one is not asked
-MOST_PASSES = 10  # over states and background, each in turn
+MOST_PASSES = 10  # over states and background, each in turn, and of the search for baselines
 SETTLED_BACKGROUND = 0.01  # of the spread of a state
 FALSE_OFFSET_RATE = 1e-3  # probability with which recordings with one baseline are given one each
 LAGS_COMPARED, MOST_COMPARED = 8, 100_000  # up to the relaxation time; samples
@@ -645,14 +645,11 @@ def _baselines(recordings: Recordings, values: np.ndarray, rest: np.ndarray, lag
                 if np.abs(centred @ moved).max() <= SETTLED_BACKGROUND * series.std():
                     break
             error = steps - basis @ mean - slope * moved[which]
-            gained = (
-                len(error) / (2 * correlated_samples(error, runs)) * np.log(least / positive(error.var()))
-            )
-            # Recordings that are moved apart share no steps that could tell.
-            if (
-                gained <= 2 * np.log(1 / FALSE_OFFSET_RATE)
-                or (series - offsets[labels]).var() > 2 * series.var()
-            ):
+            independent = len(error) / (2 * correlated_samples(error, runs))
+            gained = independent * np.log(least / positive(error.var()))
+            # Recordings moved apart share no steps that could tell; twice the variance is a choice.
+            moved_apart = (series - offsets[labels]).var() > 2 * series.var()
+            if moved_apart or gained <= 2 * np.log(1 / FALSE_OFFSET_RATE):
                 continue
             least, score = error.var(), slope * error
             spread = score.var() / positive(np.mean(slope**2)) * 2 * correlated_samples(score, runs)
