@@ -783,6 +783,7 @@ RESIDENTS: Sequence[Resident] = (
     Resident("clipping", "mass", {"L": 1.2}, "above"),
     Resident("clipping", "mass", {"L": -1.2}, "below"),
     Resident("clipping", "mass", {"H": 1.2, "L": -1.0}),
+    Resident("rectification", "cart", {"c": 1.0}),
     Resident("quadratic drag", "cart", {"c": 0.3}, "relative to u"),
     Resident("quadratic drag", "ball in a tube", {"c": 0.35, "k": 3.2}, "that u drives"),
     Resident("ground effect", "drone", {"c": 0.03}),

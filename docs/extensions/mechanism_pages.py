@@ -87,6 +87,7 @@ def looked_for(parameter: MechanismParameter) -> str:
         "lattice_of": "known: the step in which recorded values lie",
         "top_of": "where recorded values end above in a plateau",
         "bottom_of": "where recorded values end below in a plateau",
+        "magnitude_of": "one: recorded values never fall below zero, and those of the simulation do",
         "samples": f"{at} times the time between samples",
         "frequencies": f"{shape.frequencies} frequencies that the recordings resolve",
     }[way(shape)]

@@ -280,8 +280,7 @@ def path_of(
 
     def guess(states: int, place: int = column) -> np.ndarray:
         low, high = np.quantile(values[:, place], [0.05, 0.95])
-        evenly = np.linspace(low, high, states)
-        return np.sort(each[place][:, 0]) if len(each[place]) == states else evenly
+        return np.sort(each[place][:, 0]) if len(each[place]) == states else np.linspace(low, high, states)
 
     most, further = list[slice](), MOST_SAMPLES
     for run in runs:

@@ -502,8 +502,7 @@ def _wanted(file: str, name: str, plain: list[str], known: list[int], remarks: l
         matches = [place for place in known if called(plain[place]) == sought]
         if len(matches) == 1:
             if plain[matches[0]] != name:
-                values = {"title": plain[matches[0]], "name": name}
-                remarks.append(Remark("data.name_in_formulas", values))
+                remarks.append(Remark("data.name_in_formulas", {"title": plain[matches[0]], "name": name}))
             return matches[0]
     titles = [plain[place] for place in known if plain[place]]
     remedy = suggestion(name, titles, otherwise=f"the measured columns are {', '.join(titles)}")

@@ -407,8 +407,7 @@ class SnapshotPairs:
         found, shares = [], np.linspace(0, 1, parts + 1)[1:-1]
         for each in [np.round(self.h / np.median(self.h), 2)] if of_steps else self.x0.T:
             edges = np.unique(np.quantile(each, shares))
-            part = np.searchsorted(edges, each, side="right")
-            found.append(part[:, None] == np.arange(1, len(edges) + 1))
+            found.append(np.searchsorted(edges, each, side="right")[:, None] == np.arange(1, len(edges) + 1))
         return np.concatenate(found, axis=1)
 
     def take(self, rows: np.ndarray | slice) -> SnapshotPairs:

@@ -62,6 +62,8 @@ class Shape(_Part):
     top_of: str | None = None
     #: The same below
     bottom_of: str | None = None
+    #: An output whose recorded values have lost their sign: one. Without one the mechanism is not tried.
+    magnitude_of: str | None = None
     #: Multiples of the time between samples are tried; a single one is not fitted
     samples: bool = False
     #: So many angular frequencies that the recordings can resolve are tried
@@ -76,7 +78,7 @@ class Shape(_Part):
     @property
     def recorded(self) -> str | None:
         """The output whose recorded values tell the shape by themselves."""
-        return self.lattice_of or self.top_of or self.bottom_of
+        return self.lattice_of or self.top_of or self.bottom_of or self.magnitude_of
 
 
 class MechanismParameter(_Part):

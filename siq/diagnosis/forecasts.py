@@ -407,8 +407,7 @@ def _in_place_of(
     own = white.columns[:, : len(fit.model.free)]
     tested, linear = (leading.places(fit, linear=each) if leading else [] for each in (False, True))
     change = np.linalg.lstsq(own, white.innovations, rcond=1e-10)[0] if own.shape[1] else np.zeros(0)
-    values = fit.model.values[list(fit.model.free)] + change
-    target = white.innovations + own[:, linear] @ values[linear]
+    target = white.innovations + own[:, linear] @ (fit.model.values[list(fit.model.free)] + change)[linear]
     return _Foreseen(white, target, np.delete(own, tested, axis=1), fold)
 
 
@@ -509,11 +508,11 @@ def _fitted_at(
     """
     candidate, probe, found = site.candidate, site.terms[0], list[Horizon]()
     assert candidate is not None and isinstance(probe, Probe)
-    known = dict(probe.shapes)  # to begin with; then what the horizon before led to
+    known = dict[str, float]()  # what the horizon before led to
     for each in horizons:
         try:
-            x = probe.states_along(each.fit, each.data, each.fit.x)
-            model, rough = candidate.begun(each.fit.model, known), horizons[0].data.roughness
+            begun, x = probe.begin(each.fit, each.data, each.fit.x)
+            model, rough = candidate.begun(each.fit.model, begun | known), horizons[0].data.roughness
             fit = _fitted(model, each.data, each.fit, x, rough, budget=budget)
             if not candidate.admits(fit, each.data):  # it is refuted, whatever it promised
                 error = NumericalFailure("its best parameters have a sign or a period that it cannot have")
@@ -528,7 +527,9 @@ def _fitted_at(
             untried[candidate.label] = NotFitted.of(candidate, error)
             return None
     untried.pop(candidate.label, None)
-    if not all(each.fit.converged or each.fit.model.edges for each in found):
+    # What jumps, or reads the same either way, may go to and fro. Numbers are those of the first horizon.
+    folds = any(search.magnitude_of for search in candidate.searches)
+    if not (found[0].fit.converged or found[0].fit.model.edges or folds):
         untried[candidate.label] = NotFitted.of(candidate, NumericalFailure(UNSETTLED))
     return found, _gain_over(found, horizons)
 
@@ -570,6 +571,10 @@ def _next_rung(
     # what the state would: behind a gear with play the motor seems to wait whenever it turns.
     far, promise = _gains(horizons[-1:], places, None, budget, untried)
     ahead = far[int(np.argmax(promise + np.array([site.prior for site in far])))]
+    # A sensor without a sign bends the motion until it is seen; what was fitted cannot show it.
+    for site in places:
+        if site.candidate is not None and any(each.magnitude_of for each in site.candidate.searches):
+            attempt(site)
     own_states = ahead.candidate is not None and ahead.candidate.model.dimension > base.model.dimension
     if own_states and ahead.label not in {sites[k].label for k in order if gains[k] > 0}:
         for term in ahead.terms:
@@ -580,10 +585,22 @@ def _next_rung(
             break
         budget.says(f"candidate {number} of at most {min(ATTEMPTS, len(order))}: {sites[place].label}")
         attempt(sites[place], weights[place])
+    # Free to follow any motion is what brings a state of its own; a clock, since of what swings by itself any
+    # season of its period foresees as much; and what is not absent where it is zero, as the end of a sensor's
+    # range.
+    apart = [[s.frequencies or s.top_of or s.bottom_of for s in each.searches] for each in candidates]
+    d = base.model.dimension
+    free = {e.label for e, one in zip(candidates, apart, strict=True) if any(one) or e.model.dimension > d}
+    # What makes a system swing by itself is not seen a little at a time, and a season of its period foresees
+    # nearly as much.
+    if not leading or max(leading, key=lambda each: each.weight).site.label in free:
+        delays = {k: e for k, e in named.items() if e.model.dimension > d and not e.amplitudes}
+        for place in [k for k, one in delays.items() if one.label not in {*fitted, *untried}]:
+            attempt(sites[place])
     if not leading:
         return None
     alone = {site.label: site for site in sites if site.candidate is not None}
-    d, outdone = base.model.dimension, set[str]()
+    outdone = set[str]()
     if max(leading, key=lambda each: each.weight).candidate.model.dimension > d:
         # States of its own may follow any motion: what needs none is fitted first, whatever it promises.
         stateless = {each.label for each in candidates if each.model.dimension == d} - {*fitted, *untried}
@@ -602,11 +619,7 @@ def _next_rung(
     plausible = [each for each in leading if each.weight > heaviest + np.log(PLAUSIBLE)]
     leader = min(plausible, key=lambda each: (len(each.candidate.new), -each.weight))
     errors = cache(lambda one: _left_out(one.horizons[0].fit, [one.candidate], base.noise, context))
-    # All others are compared in the place of one that brings no state of its own; nor a clock, since of what
-    # swings by itself any season of its period foresees as much; and that is absent where it is zero, which
-    # the end of a sensor's range is not.
-    apart = [[s.frequencies or s.top_of or s.bottom_of for s in each.searches] for each in candidates]
-    free = {e.label for e, one in zip(candidates, apart, strict=True) if any(one) or e.model.dimension > d}
+    # All others are compared in the place of one that is not free to follow the motion.
     steady, ground = [each for each in leading if each.site.label not in free], None
     if steady:
         ground = leader if leader in steady else max(steady, key=lambda each: each.weight)

@@ -190,8 +190,7 @@ def _refits_left_out(
                 if wrong:
                     LOGGER.info("without rows of one part, %s would be negative", ", ".join(sorted(wrong)))
                     model = model.held(wrong, zero=wrong)
-            run = simulated(again, out, noise=noise, substeps=fit.substeps)
-            own = squared_errors(run, out, spread)
+            own = squared_errors(simulated(again, out, noise=noise, substeps=fit.substeps), out, spread)
         except NumericalFailure:
             return None
         # One that does not quite settle, as where a reading is cut off, is judged by what it predicts.

@@ -93,6 +93,8 @@ def places_of(search: Shape, data: Measurements, model: Dynamics, x: np.ndarray)
         values = data.outputs[:, place]
         if search.lattice_of is not None:
             found = resolution_step(values)
+        elif search.magnitude_of is not None:
+            found = 1.0 if np.nanmin(values) >= -4 * np.sqrt(data.roughness[place]) else None
         else:
             side = 1.0 if search.top_of is not None else -1.0
             top = _plateau(side * values, data.recording, noise=float(np.sqrt(data.roughness[place])))
@@ -142,8 +144,7 @@ def along(formulas: Sequence[sympy.Expr], model: Dynamics, data: Measurements, x
     """Formulas ``(c,)`` of parameters, states, inputs and time at all samples, shape ``(c, n)``."""
     known = {symbol(each.name): each.value for each in model.parameters}
     signals = data.signals(data.t, data.recording, delays=())
-    arguments = list(coordinates_of(model).values())
-    compiled = compile_values([each.subs(known) for each in formulas], arguments)
+    compiled = compile_values([each.subs(known) for each in formulas], list(coordinates_of(model).values()))
     values = compiled(*x.T[: model.dimension], *signals.inputs, signals.t)
     return np.stack([np.broadcast_to(each, data.t.shape) for each in values])
 
@@ -367,7 +368,7 @@ def _build_candidate(
         equations=(*equations.values(), *(formula for _, formula in further)),
         outputs=tuple(outputs.items()),
     )
-    recorded = ("lattice_of", "top_of", "bottom_of")
+    recorded = ("lattice_of", "top_of", "bottom_of", "magnitude_of")
     searches = []  # with the system's own names in their formulas
     for shape in shapes.values():
         update = dict[str, str]()

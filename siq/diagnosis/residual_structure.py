@@ -92,8 +92,7 @@ def _autocorrelation(left: np.ndarray, recording: np.ndarray, known: np.ndarray,
         for lag in range(1, LAGS + 1):
             same = owner[lag:] == owner[:-lag]
             correlation = float((y[lag:] * y[:-lag])[same].sum()) / power
-            pairs = int(same.sum())
-            statistic += correlation**2 * size**2 / max(pairs, 1)
+            statistic += correlation**2 * size**2 / max(int(same.sum()), 1)
             count += 1
     return float(scipy.stats.chi2.sf(statistic, count)) if count else 1.0
 
@@ -151,8 +150,7 @@ class Remainder:
         best = alone.curves[0] if alone.curves else None
         systematic = 0.0 if best is None else best.gain - 2 * best.term.width
         left = max(alone.total - alone.freedom, systematic, 0.0)
-        share = float(np.clip(1 - left / (before.total - before.freedom), 0.0, 1.0))
-        return cls(before, after, share)
+        return cls(before, after, float(np.clip(1 - left / (before.total - before.freedom), 0.0, 1.0)))
 
 
 def remaining_forces(fit: Fit, data: Measurements, roles: Roles) -> list[Remark]:

@@ -26,7 +26,7 @@ from siq.inference.budget import Budget, BudgetSpent, evaluation
 from siq.inference.kalman_filter import Grid, Linearisation, Whitened, linearise, profile_likelihood, whiten
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
-from siq.inference.trajectories import EDGE_SUBSTEPS, run_along, spread_edges
+from siq.inference.trajectories import EDGE_SUBSTEPS, fit_trajectories, run, run_along, spread_edges
 from siq.systems.dynamics import Dynamics, Tape
 from siq.systems.formulas import compile_values
 
@@ -99,6 +99,12 @@ class Probe:
         choices: list[tuple[tuple[str, float], ...]] = [()]
         for name, search in zip(candidate.shapes, candidate.searches, strict=True):
             found = places_of(search, data, model, x)
+            if search.magnitude_of is not None and len(found):
+                formula = dict(candidate.model.outputs)[search.magnitude_of]
+                given = run(candidate.model, Grid(data, EDGE_SUBSTEPS), x[data.first[:-1]])
+                simulated = along([formula], candidate.model, data, given)
+                noise = np.sqrt(data.roughness[model.output_names.index(search.magnitude_of)])
+                found = found[: int((simulated < -4 * noise).any())]
             choices = [(*before, (name, float(place))) for before in choices for place in found]
         return [cls(candidate, shapes) for shapes in choices]
 
@@ -172,12 +178,28 @@ class Probe:
 
         return evaluated
 
-    def states_along(self, fit: Fit, data: Measurements, x: np.ndarray) -> np.ndarray:
-        """States ``(n, d)`` along recordings, with those that it brings to a fit, shape ``(n, d + k)``."""
+    def begin(self, fit: Fit, data: Measurements, x: np.ndarray) -> tuple[dict[str, float], np.ndarray]:
+        """Where to begin on top of a fit: values by name, and states along recordings.
+
+        States ``(n, d)`` follow those that it brings, shape ``(n, d + k)``. What follows recordings without a
+        sign has lost it: there it begins with the simulation as given, fitted as it runs by itself.
+        """
+        known = dict(self.shapes)
+        if any(search.magnitude_of for search in self.candidate.searches):
+            model = self.candidate.begun(self.candidate.model, known)
+            first, grid, off = data.first[:-1], Grid(data, fit.substeps), []
+            for begin in (x[first], -x[first]):
+                shown = along([h for _, h in model.outputs], model, data, run(model, grid, begin)).T
+                squares = np.where(np.isfinite(data.outputs), (shown - data.outputs) ** 2, 0.0)
+                off.append(np.add.reduceat(squares / fit.noise.measurement, first).sum(axis=1))
+            begin = np.where(off[1] < off[0], -1.0, 1.0)[:, None] * x[first]
+            free = fit_trajectories(model, data, begin=begin, noise=fit.noise, substeps=fit.substeps)
+            return {each.name: each.value for each in free.model.parameters}, free.x
         if not self.candidate.scales:
-            return x
+            return known, x
         grid = Grid(data, fit.substeps)
-        return np.concatenate([x, _at_samples(self._carried(Trajectories(fit.model, grid, x)), grid)], axis=1)
+        further = _at_samples(self._carried(Trajectories(fit.model, grid, x)), grid)
+        return known, np.concatenate([x, further], axis=1)
 
     def _carried(self, trajectories: Trajectories) -> list[np.ndarray]:
         """Its further states at all nodes, carried along each recording from its begin.

@@ -101,8 +101,7 @@ class Place:
                 signals = grid.at_samples(()) if node is None else grid.signals(node, ())
                 known = compiled(*x, *signals.inputs, signals.t)
                 count, names = len(self.coordinates), model.output_names if node is None else model.states
-                courses = [np.broadcast_to(each, x.shape[1]) for each in known[:count]]
-                basis = self.values(np.stack(courses))
+                basis = self.values(np.stack([np.broadcast_to(each, x.shape[1]) for each in known[:count]]))
                 for (name, _), factor in zip(targets, known[count:], strict=True):
                     yield names.index(name), slice(None), basis * factor
 

@@ -329,7 +329,7 @@ def _with_memories(fit: Fit, models: Sequence[AugmentedModel], context: FitConte
         begun_model = candidate.begun(candidate.model, dict(each.term.shapes))
         candidate = replace(candidate, model=begun_model, log_cost=cost)
         try:
-            x = each.term.states_along(fit, context.data, fit.x)
+            _, x = each.term.begin(fit, context.data, fit.x)
         except NUMERICAL_ERRORS as error:
             LOGGER.info("%s cannot be fitted: %s", candidate.label, error)
             continue

@@ -131,5 +131,4 @@ def evaluation(model: Dynamics, data: Measurements, *, columns: int = 0) -> floa
 
     There may be further columns than those of states and free parameters, such as those of candidates.
     """
-    width = 1 + model.dimension + len(model.free) + columns
-    return (len(data.t) + OVERHEAD) * model.dimension * width
+    return (len(data.t) + OVERHEAD) * model.dimension * (1 + model.dimension + len(model.free) + columns)

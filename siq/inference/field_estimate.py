@@ -169,8 +169,7 @@ class Verdict:
     @classmethod
     def of_probability(cls, probability: float, limit: float, reason: str = "") -> Verdict:
         """Passed where chance makes a figure so likely; the figures are powers of ten below 1."""
-        rarity = -float(np.log10(min(max(probability, 1e-300), 1.0)))
-        return cls.of(rarity, -float(np.log10(limit)), reason)
+        return cls.of(-float(np.log10(min(max(probability, 1e-300), 1.0))), -float(np.log10(limit)), reason)
 
     @classmethod
     def not_tested(cls, reason: str) -> Verdict:

@@ -458,8 +458,7 @@ class _Case:
             return diffusion.intensity(found.noise_rate)
         states = filtered_recordings(found, self.recordings, pair_step=self.pair_step).values
         forces = found.noise_rate if found.noise is None else found.noise.diffusion(1.0).at(states)
-        products = diffusion.precision_at(states) * forces
-        return float(products.sum(axis=(1, 2)).mean() / states.shape[1])
+        return float((diffusion.precision_at(states) * forces).sum(axis=(1, 2)).mean() / states.shape[1])
 
     def _with_diffusion(self, found: FieldEstimate, samples: int) -> tuple[FieldEstimate, DiffusionSource]:
         """The estimate with D, and where that is from: given, estimated of so many samples, or the unit."""
@@ -646,8 +645,7 @@ class _Case:
     @cached_property
     def slow_forces(self) -> list[FieldEstimate]:
         """f with a slow force that has noise alone, and with one that follows the state, if found."""
-        names = (*self.recordings.names, f"force_{self.recordings.names[0]}")
-        library = field_library(names, self.options)
+        library = field_library((*self.recordings.names, f"force_{self.recordings.names[0]}"), self.options)
         force = ObservationModel(library, Diffusion.identity(2), hidden=True, slow_force=1.0)
         return self._fits(force, replace(force, follows=True))
 

@@ -216,8 +216,7 @@ class Linearisation:
         """
         found = self.filtered(first, step, noise, begin=begin, kept=True)
         predicted, filtered, before, after, *gains = found[5:]
-        innovations = np.ascontiguousarray(found[0][:, :, 0])
-        chain = first, self.transition, self.measured, self.residual, innovations
+        chain = first, self.transition, self.measured, self.residual, np.ascontiguousarray(found[0][:, :, 0])
         return smooth_backwards(*chain, predicted, before, *gains), filtered, after
 
     def sums(self, first: np.ndarray, step: np.ndarray, noise: Noise) -> tuple[float, float, int]:

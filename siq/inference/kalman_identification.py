@@ -386,8 +386,7 @@ def of_all_states(
     recordings: Recordings, found: FieldEstimate, *, pair_step: float | None = None
 ) -> Recordings:
     """The recordings, with the velocities of an estimate that were not recorded among their states."""
-    hidden = found.hidden_states
-    return filtered_recordings(found, recordings, pair_step=pair_step) if hidden else recordings
+    return filtered_recordings(found, recordings, pair_step=pair_step) if found.hidden_states else recordings
 
 
 def filtered_recordings(

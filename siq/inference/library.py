@@ -148,8 +148,7 @@ class CandidateLibrary:
         absent = np.zeros((targets, q), dtype=bool)
         absent[d] = ~self.in_potential
         absent[d + 1 :] = ~self.in_circulatory
-        zeros = np.eye(targets * q)[absent.ravel()]
-        return np.concatenate([identity.reshape(d * q, targets * q), zeros])
+        return np.concatenate([identity.reshape(d * q, targets * q), np.eye(targets * q)[absent.ravel()]])
 
 
 def candidate_library(

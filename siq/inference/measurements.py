@@ -179,8 +179,7 @@ def course_of_input(t: np.ndarray, u: np.ndarray, interpolation: str) -> scipy.i
     padding = min(PADDING, len(u) - 1)
     # Mirrored through its end points the signal goes on without a jump and without a kink.
     left = 2 * u[0] - u[padding:0:-1]
-    right = 2 * u[-1] - u[-2 : -padding - 2 : -1]
-    longer = np.concatenate([left, u, right])
+    longer = np.concatenate([left, u, 2 * u[-1] - u[-2 : -padding - 2 : -1]])
     line = np.linspace(longer[0], longer[-1], len(longer))
     dense = scipy.signal.resample(longer - line, OVERSAMPLING * len(longer))
     dense_t = t[0] + step.mean() * (np.arange(len(dense)) / OVERSAMPLING - padding)

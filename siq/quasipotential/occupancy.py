@@ -493,5 +493,4 @@ def _probability_of(count: DwellCount, mean: float, error: float) -> float:
     expected = count.time / mean * np.exp(np.clip(error * nodes, -50, 50))
     weights = weights / weights.sum()
     fewer = float(weights @ special.pdtr(count.visits, expected))
-    more = float(weights @ special.gammainc(count.visits, expected))
-    return min(2 * min(fewer, more), 1.0)
+    return min(2 * min(fewer, float(weights @ special.gammainc(count.visits, expected))), 1.0)

@@ -228,8 +228,7 @@ class OutputWeights:
         if noisy:
             self.coefficients = corrected(self.basis, best[0], self.coefficients, best[1])
         # The standard error of f at the points, of independent errors in the velocities, as a share of f.
-        design = self.basis.design(self.points)
-        spread = ((design @ best[0].inverse(best[1])) ** 2).sum(axis=1).mean()
+        spread = ((self.basis.design(self.points) @ best[0].inverse(best[1])) ** 2).sum(axis=1).mean()
         size = (self.drift(self.points) ** 2).sum(axis=1).mean()
         self.uncertainty = float(np.sqrt(spread * (unexplained**2).mean(axis=0).sum() / size))
         logger.info("f is uncertain by %.1e of itself", self.uncertainty)
@@ -429,8 +428,7 @@ class OutputWeights:
         """V over units as a network, with one for g of the same units, fitted at points."""
         steepness, flow, of_units = float(weights[-1]), self.drift(points), basis.of_units(weights)
         circulatory = flow + self.diffusion.push(points, basis.gradients(points) @ weights)
-        functions = np.column_stack([basis.hidden(points), np.ones(len(points))])
-        of_g = _LeastSquares(functions).solve(circulatory)
+        of_g = _LeastSquares(np.column_stack([basis.hidden(points), np.ones(len(points))])).solve(circulatory)
         layers = (basis.weights, basis.biases[None])
         lowest = -(np.tanh(basis.biases) @ of_units) / steepness  # V is zero at μ
         return TrainedNetworks(

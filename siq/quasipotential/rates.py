@@ -480,8 +480,7 @@ class _Frame:
         density = rise / np.linalg.norm(self.velocities[::2], axis=1)
         rest = float(np.linalg.norm(self.points[-1] - problem.end))
         outer = rest * (density[-1] + self.continued(density)) / 2
-        along = simpson(rise * self.pace[::2], x=self.grid[::2])
-        return float(first + along + outer)
+        return float(first + simpson(rise * self.pace[::2], x=self.grid[::2]) + outer)
 
     def volume(self) -> tuple[float, float]:
         """The inverse of the density at the start of the path, up to ``(πε)^(d/2)``; and a power of ε.

@@ -391,8 +391,7 @@ class RefinementContext:
         It stands in `model.json` as a certificate with one test, which has to refuse them.
         """
         assert self.networks is not None
-        draw = generator(self.seed, self.number, Purpose.SHUFFLE)
-        randomised = shuffled(self.networks, generator=draw)
+        randomised = shuffled(self.networks, generator=generator(self.seed, self.number, Purpose.SHUFFLE))
         if refined is None or not (refined.wells or refined.potential is not None):
             return uncertified("there is no refined V to compare with")
         formulas = refined if refined.potential is not None else refined.wells

@@ -466,8 +466,7 @@ def _barrier_uncertainty(path: MinimumActionPath, found: AnyField) -> tuple[floa
     if isinstance(found, Dynamics):
         return 0.0, 0.0
     middle, force, spent = _pieces(path, found.dynamics)
-    terms = found.library.evaluate(middle)
-    slope = -2 * np.einsum("n,nq,nd->qd", spent, terms, force)
+    slope = -2 * np.einsum("n,nq,nd->qd", spent, found.library.evaluate(middle), force)
     variance, by_rivals = float(found.variance(slope, of_mean=True)), float(found.bias(slope))
     if found.noise is not None:
         slope = -2 * (spent[:, None] * found.noise.push_slopes(middle, force)).sum(axis=0) / found.intensity

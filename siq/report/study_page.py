@@ -323,8 +323,7 @@ def _states_table(seen: RecordStates, summary: LandscapeSummary | None = None) -
                 visits or time_text(well.time(summary.noise))
             )
     names = [f"state {number + 1}" for number in range(len(found))]
-    rows = [(name, *one) for name, one in cells.items()]
-    return pd.DataFrame(rows, columns=["", *names])
+    return pd.DataFrame([(name, *one) for name, one in cells.items()], columns=["", *names])
 
 
 def _formulas(results: StudyResults) -> list[FormulaRow]:
@@ -456,8 +455,7 @@ def _coefficients(results: StudyResults) -> tuple[pd.DataFrame, pd.DataFrame] | 
             "exact": chosen["exact"].to_numpy(),
         }
     )
-    whole = mine[mine["component"].str.match("U$|g_|f_")]
-    return table, whole.drop(columns=["run", "method"])
+    return table, mine[mine["component"].str.match("U$|g_|f_")].drop(columns=["run", "method"])
 
 
 def _remarks(results: StudyResults) -> list[str]:

@@ -177,8 +177,7 @@ class LandscapeSummary:
     def _potential(self, x: np.ndarray) -> np.ndarray:
         if self.formula is not None and self.points is not None:
             low, high = self.points.min(axis=0), self.points.max(axis=0)
-            inside = ((x >= low) & (x <= high)).all(axis=1)
-            return np.where(inside, 2 * self.formula.values(x), np.nan)
+            return np.where(((x >= low) & (x <= high)).all(axis=1), 2 * self.formula.values(x), np.nan)
         known = [(w.height, v) for w, v in zip(self.wells, self.formulas, strict=False) if v is not None]
         if not known:
             return np.full(len(x), np.nan)

@@ -318,8 +318,7 @@ class Basin:
         width = np.ptp(further.reshape(-1, further.shape[2]), axis=0)
         added = _chosen(further, center, width, generator) + np.array([len(self.states), 0])
         spread = len(self.states) if self.spread is None else self.spread
-        states = np.concatenate([self.states, further])
-        return Basin(states, np.concatenate([self.chosen, added]), spread)
+        return Basin(np.concatenate([self.states, further]), np.concatenate([self.chosen, added]), spread)
 
 
 def basin_of(

@@ -192,8 +192,7 @@ class _Folds(_Equilibria):
 
     def residual(self, y: np.ndarray) -> np.ndarray:
         z, q = y[: self.count], y[self.count :]
-        slopes = self.family.slopes(z)[:, : self.d]
-        return np.concatenate([self.family.flow(z), slopes @ q, [q @ q - 1]])
+        return np.concatenate([self.family.flow(z), self.family.slopes(z)[:, : self.d] @ q, [q @ q - 1]])
 
     def slope(self, y: np.ndarray) -> np.ndarray:
         d, z, q = self.d, y[: self.count], y[self.count :]

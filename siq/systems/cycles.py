@@ -215,8 +215,7 @@ def _unstable_rows(across: np.ndarray, flows: np.ndarray, count: int) -> np.ndar
     for _ in range(MAX_POWER_ITERATIONS):
         rows, current = np.empty((len(flows), count, across.shape[2])), last
         for k in range(len(flows) - 1, -1, -1):
-            moved = current @ flows[k] @ across[k].T
-            current = np.linalg.qr(moved.T)[0].T @ across[k]
+            current = np.linalg.qr((current @ flows[k] @ across[k].T).T)[0].T @ across[k]
             rows[k] = current
         turned = np.linalg.norm(current.T @ current - last.T @ last)
         last = current

@@ -176,8 +176,7 @@ def _classified(
 
 def crossing_rate(dynamics: _VectorField, points: np.ndarray, width: np.ndarray) -> float:
     """At which f crosses a box of a width, per unit of time: the median over points ``(n, d)``."""
-    speed = np.linalg.norm(dynamics.drift(points) / positive(width), axis=1)
-    return float(np.median(speed))
+    return float(np.median(np.linalg.norm(dynamics.drift(points) / positive(width), axis=1)))
 
 
 def classify(dynamics: _VectorField, position: np.ndarray, *, rate: float = 0.0) -> Equilibrium:

@@ -285,8 +285,7 @@ def split_escapes(
     def heights(x: np.ndarray) -> np.ndarray:
         """ξ, -∞ in A and ∞ in B."""
         found = np.where(start.height(x) <= 1, -np.inf, progress(x))
-        reached = np.any([one.height(x) <= 1 for one in targets], axis=0)
-        return np.where(reached, np.inf, found)
+        return np.where(np.any([one.height(x) <= 1 for one in targets], axis=0), np.inf, found)
 
     # Σ lies where few walkers have been after a short time.
     x = start.evenly(PILOTS)

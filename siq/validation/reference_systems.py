@@ -72,8 +72,7 @@ def reference_systems() -> dict[str, _ReferenceSystem]:
     >>> systems["maier-stein"].barriers[0].value
     0.5
     """
-    path = Path(__file__).with_name("reference_systems.yaml")
-    systems = yaml.safe_load(path.read_text(encoding="utf-8"))
+    systems = yaml.safe_load(Path(__file__).with_name("reference_systems.yaml").read_text(encoding="utf-8"))
     return {name: _system(name, **known) for name, known in systems.items()}
 
 

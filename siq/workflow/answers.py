@@ -69,8 +69,7 @@ def _of_study(answer: Mapping[str, Any]) -> tuple[list[str], Exit]:
     if not answer["formulas"] and answer.get("states"):
         return [*lines, "No formula was found: the states and their times are the answer."], Exit.ANSWERED
     if not answer["formulas"]:
-        why = "No formula was found; the page says at which step, and what to do."
-        return [*lines, why], Exit.NO_ANSWER
+        return [*lines, "No formula was found; the page says at which step, and what to do."], Exit.NO_ANSWER
     if answer["runs"] == 1 and answer["certified"] == "all":
         lines.append("The formula passed its certificate.")
     else:

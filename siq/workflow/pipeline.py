@@ -119,8 +119,7 @@ def identify_run(
 ) -> StepResult[FieldEstimate]:
     """f of run `number`, from its recordings; None where drawing them failed."""
     if recordings is None:
-        reason = "the run has no trajectories"
-        return StepResult(None, Outcome(number, Step.IDENTIFY, Status.SKIPPED, reason))
+        return StepResult(None, Outcome(number, Step.IDENTIFY, Status.SKIPPED, "the run has no trajectories"))
     named, options = zip(recordings.names, recordings.units, strict=True), settings.identification
     for one in unusual(recordings):
         if one.code == "data.wrapped_angle":
@@ -318,8 +317,7 @@ def landscape_of_run(
         return StepResult(None, Outcome(number, Step.LANDSCAPE, Status.SKIPPED, reason))
     recordings = of_all_states(recordings, record, pair_step=settings.sampling.pair_step)
     x = record.wrapped(snapshot_pairs(recordings, pair_step=settings.sampling.pair_step)).x0
-    draw = generator(settings.seed, number, Purpose.LANDSCAPE)
-    points = x[evenly_spread(x, generator=draw)]
+    points = x[evenly_spread(x, generator=generator(settings.seed, number, Purpose.LANDSCAPE))]
     noise = NoiseStrength(settings.noises[0]) if settings.noises else None
     if (shown := record.noise_strength) is not None:  # what the recordings show, before what the study gives
         noise = NoiseStrength(*shown, source="estimated")

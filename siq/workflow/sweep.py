@@ -171,8 +171,7 @@ def _wells_along(branches: Sequence[Branch]) -> list[np.ndarray]:
     def place(stretch: tuple[int, int, int]) -> tuple[float, ...]:
         index, first, last = stretch
         branch = branches[index]
-        at = np.argmin(branch.values[first:last]) + first
-        return tuple(np.round(branch.states[at], 6))
+        return tuple(np.round(branch.states[np.argmin(branch.values[first:last]) + first], 6))
 
     number = [np.full(len(branch.values), -1) for branch in branches]
     for well, (index, first, last) in enumerate(sorted(stretches, key=place)):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
 from typing import Any
@@ -20,8 +21,9 @@ from siq.diagnosis.mechanisms import (
     _plateau,
     places_of,
 )
-from siq.diagnosis.screening import screen_all
+from siq.diagnosis.screening import Probe, screen_all
 from siq.diagnosis.study import SearchOptions, _measurements_of
+from siq.inference.measurements import Measurements
 from siq.inference.recalibration import recalibrate
 from siq.systems.dynamics import Dynamics, _without_teeth
 
@@ -249,6 +251,26 @@ def test_recordings_on_one_clock_tell_a_frequency_to_a_part_of_their_span() -> N
     data = _measurements_of(pd.concat(table), model)
     places = places_of(Shape(frequencies=90), data, model, np.zeros((1500, 2)))
     assert np.abs(places - 0.7413).min() < 0.25 / 800  # of a turn over all of them
+
+
+def test_a_sign_is_lost_only_where_the_simulation_has_one() -> None:
+    resident = next(each for each in RESIDENTS if each.name == "rectification")
+    data, model, candidate = recorded(resident), HOMES["cart"].model, the("rectification", "cart")
+    (name,), x = candidate.shapes, data.outputs
+
+    def tried(candidate: MechanismCandidate, data: Measurements) -> list[Probe]:
+        return Probe.all_of(candidate, data, model, x)
+
+    (probe,) = tried(candidate, data)
+    assert dict(probe.shapes) == {name: 1.0}
+    assert not tried(candidate, replace(data, outputs=x - 0.5))
+    assert not tried(replace(candidate, model=candidate.begun(model, {"g": 0.0})), data)
+    # Fits that follow the recordings have lost it; the simulation that runs by itself has it, and the numbers.
+    fit, _ = recalibrate(model, data)
+    known, states = probe.begin(fit, data, fit.x)
+    assert known == pytest.approx({"g": 0.4, "d": 0.3, name: 1.0}, rel=0.02)
+    assert abs(fit.model.parameters[0].value) < 0.2
+    assert (states < -0.5).any() and np.abs(np.abs(states) - x).max() < 0.1
 
 
 def test_a_period_has_to_come_back_within_a_recording() -> None:

@@ -33,7 +33,7 @@ NAMES = (
     "diode or exponential loss", "cooling by evaporation", "outflow through an opening",
     "thermal radiation", "reverse reaction or backflow", "adaptation", "waning immunity", "recruitment",
     "seasonality", "process noise", "sensor gain or offset", "thermal drift", "sensor lag", "quantisation",
-    "clipping", "input gain", "Joule heating", "thrust of a propeller", "ground effect",
+    "rectification", "clipping", "input gain", "Joule heating", "thrust of a propeller", "ground effect",
     "pull across a gap", "overpotential", "actuator lag", "hidden capacity", "maturation delay",
     "delayed self-limitation", "cogging or gear ripple", "clock offset and drift",
 )  # fmt: skip

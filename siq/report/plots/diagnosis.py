@@ -494,8 +494,7 @@ def _limits_of(curves: Iterable[pd.DataFrame]) -> tuple[float, float]:
             supported = known & (error <= SUPPORTED * np.median(error[known]))
             values.append(value[supported])
             # The error of a value that is well known belongs to the picture.
-            largest = float(np.abs(value[supported]).max())
-            small = supported & (2 * error < largest)
+            small = supported & (2 * error < float(np.abs(value[supported]).max()))
             values += [value[small] - 2 * error[small], value[small] + 2 * error[small]]
     together = np.concatenate(values)
     low, high = float(together.min()), float(together.max())
