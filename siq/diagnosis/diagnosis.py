@@ -33,7 +33,7 @@ from siq.errors import InputError, NumericalFailure
 from siq.inference.budget import Budget, BudgetSpent
 from siq.inference.kalman_filter import MAX_SUBSTEPS
 from siq.inference.measurements import first_states, with_expectations
-from siq.inference.recalibration import most_varying, recalibrate
+from siq.inference.recalibration import fit_with_process_noise_as_needed, most_varying, recalibrate
 from siq.inference.trajectories import scored_rows
 from siq.remarks import Remark
 from siq.systems.cards import load_system
@@ -296,20 +296,28 @@ def solve_case(
     allowed = case.settings.budget
     budget = Budget(work=allowed.evaluations, seconds=allowed.seconds, tell=tell, clock=clock)
     try:
-        found, shown, statement = _judged(case, budget)
-        held = case.with_held_inputs() if statement.verdict.mismatch else None
-        if held is not None:
-            # What a computer writes is held until the next sample: on a line between samples that is late.
+        # What a computer writes is held until the next sample: on a line between samples that is late.
+        same, on_lines = case.settings.search.same, None
+        if (held := case.with_held_inputs()) is not None:
             with contextlib.suppress(*NUMERICAL_ERRORS, BudgetSpent):
-                same = case.settings.search.same
-                likelier = recalibrate(with_expectations(held.system), held.learn, budget=budget)[0]
-                if likelier.log_likelihood > found.search.recalibrated.log_likelihood + same / 2:
-                    again = other, _, stated = _judged(held, budget)
+                lines, steps = (
+                    recalibrate(with_expectations(each.system), each.learn, budget=budget)[0]
+                    for each in (case, held)
+                )
+                if steps.log_likelihood > lines.log_likelihood + same / 2:
+                    case, on_lines = held, case
+        found, shown, statement = _judged(case, budget)
+        if on_lines is not None and statement.verdict.mismatch:
+            # What is missing may be what made them look held.
+            with contextlib.suppress(*NUMERICAL_ERRORS, BudgetSpent):
+                final = found.final
+                moved = fit_with_process_noise_as_needed(final.model, on_lines.learn, final, budget=budget)
+                if moved.log_likelihood > final.log_likelihood:
+                    again = other, _, stated = _judged(on_lines, budget)
                     # A name fewer is worth what candidates that are not told apart may differ by.
-                    named = len(stated.mechanisms)
-                    fewer = not stated.verdict.mismatch or 0 < named < len(statement.mechanisms)
-                    if 2 * (found.final.log_likelihood - other.final.log_likelihood) < same * fewer:
-                        case, (found, shown, statement) = held, again
+                    fewer = 0 < len(statement.mechanisms) < len(stated.mechanisms)
+                    if 2 * (other.final.log_likelihood - final.log_likelihood) >= same * fewer:
+                        case, (found, shown, statement) = on_lines, again
         if statement.verdict.mismatch and not (statement.mechanisms or case.settings.varies):
             # Recordings may differ in a parameter. Where a function describes what is missing, that has to be
             # as likely; elsewhere a name may come to light behind it.

@@ -509,6 +509,7 @@ def _fitted_at(
     candidate, probe, found = site.candidate, site.terms[0], list[Horizon]()
     assert candidate is not None and isinstance(probe, Probe)
     known = dict[str, float]()  # what the horizon before led to
+    folds, settled = any(search.magnitude_of for search in candidate.searches), False
     for each in horizons:
         try:
             begun, x = probe.begin(each.fit, each.data, each.fit.x)
@@ -522,16 +523,18 @@ def _fitted_at(
                 raise NumericalFailure("it is no more than the special case of it")
             found.append(Horizon.of(fit, each.data))
             known |= {one.name: one.value for one in fit.model.parameters}
+            # What jumps, or reads the same either way, may go to and fro.
+            settled = found[0].fit.converged or bool(found[0].fit.model.edges) or folds
+            if not settled and _gain_over(found[:1], horizons[:1]) < 0:
+                break  # it leads nothing, and is no rival
         except NUMERICAL_ERRORS as error:
             LOGGER.info("%s at a horizon: %s", candidate.label, error)
             untried[candidate.label] = NotFitted.of(candidate, error)
             return None
     untried.pop(candidate.label, None)
-    # What jumps, or reads the same either way, may go to and fro. Numbers are those of the first horizon.
-    folds = any(search.magnitude_of for search in candidate.searches)
-    if not (found[0].fit.converged or found[0].fit.model.edges or folds):
+    if not settled:
         untried[candidate.label] = NotFitted.of(candidate, NumericalFailure(UNSETTLED))
-    return found, _gain_over(found, horizons)
+    return found, _gain_over(found, horizons[: len(found)])
 
 
 def _gain_over(one: Sequence[Horizon], other: Sequence[Horizon]) -> float:
@@ -558,7 +561,8 @@ def _next_rung(
             if another is not None and not (site.label in untried and site.label in fitted):
                 fitted[site.label] = _Leader(site, *another)
             leading[:] = [each for label, each in fitted.items() if label not in untried and each.gain > 0]
-            if site.label not in untried or (another is None and any(e.weight > promise for e in leading)):
+            failed = another is None or another[1] < 0
+            if site.label not in untried or (failed and any(e.weight > promise for e in leading)):
                 break
 
     weights = gains + np.array([site.prior for site in sites])
@@ -591,11 +595,13 @@ def _next_rung(
     apart = [[s.frequencies or s.top_of or s.bottom_of for s in each.searches] for each in candidates]
     d = base.model.dimension
     free = {e.label for e, one in zip(candidates, apart, strict=True) if any(one) or e.model.dimension > d}
-    # What makes a system swing by itself is not seen a little at a time, and a season of its period foresees
-    # nearly as much.
-    if not leading or max(leading, key=lambda each: each.weight).site.label in free:
-        delays = {k: e for k, e in named.items() if e.model.dimension > d and not e.amplitudes}
-        for place in [k for k, one in delays.items() if one.label not in {*fitted, *untried}]:
+    # A delay is not seen a little at a time. A season of its period foresees nearly as much as what makes a
+    # system swing by itself, and a delay of an input nearly as much as a lag.
+    likely = max(leading, key=lambda each: each.weight).site if leading else None
+    kin = None if likely is None or likely.label in free else likely.family[0]
+    delays = {k: e for k, e in named.items() if e.model.dimension > d and not e.amplitudes}
+    for place, one in delays.items():
+        if kin in (None, sites[place].family[0]) and one.label not in {*fitted, *untried}:
             attempt(sites[place])
     if not leading:
         return None
@@ -636,7 +642,10 @@ def _next_rung(
         there = ground.horizons[0].fit
         rebased = [each.rebased(base.model, there.model) for each in candidates]
         remaining = _sites(rebased, there, context, untried)
-        near = [each for each in plausible if each not in steady]
+        # A lag in the place of a delay is no more than that.
+        kind, new = ground.candidate.family, len(ground.candidate.new)
+        likes = [e for e in plausible if e.candidate.family == kind and len(e.candidate.new) == new]
+        near = [each for each in plausible if each not in steady and each not in likes]
         if near:
             # A state that follows the motion may be a simple mechanism and something simple at a time, or
             # what lasts of an error of the model, for which white noise is all that is allowed.

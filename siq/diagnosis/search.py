@@ -166,8 +166,8 @@ def _fit_most_promising(
         """Fit and judge a candidate; one that leads away, or has a sign that it cannot have, has failed."""
         candidate = promised.term.candidate
         try:
-            known, x = promised.term.begin(current, data, begin.x[:, : current.model.dimension])
-            start = dict(reached or known)
+            start, x = promised.term.begin(current, data, begin.x[:, : current.model.dimension])
+            start = dict(reached or start)
             # Linearised amplitudes can be far off, and a fit that begins there may diverge: they are a start
             # only where shapes need one.
             if not reached and candidate.amplitudes and candidate.shapes and promised.amplitudes.any():

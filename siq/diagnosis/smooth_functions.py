@@ -197,8 +197,7 @@ class SmoothFunction:
         formula = sympy.prod([each.formula(tuple(map(symbol, own))) for each, own in pairs])
         whole = self.place.unit(model, 0, len(self.place.words) - len(self.place.coordinates))
         last = self.factors[-1].width  # a first factor of two has no unit
-        units = ("1",) * (self.width - last) + (whole,) * last
-        candidate = self.place.added_to(model, formula, names, units)
+        candidate = self.place.added_to(model, formula, names, ("1",) * (self.width - last) + (whole,) * last)
         together = (*candidate.model.expected_together, *(each.expected(own) for each, own in pairs))
         begun = candidate.begun(candidate.model, dict(zip(names, self.begin, strict=True)))
         kind: Kind = CURVE if len(self.place.coordinates) == 1 else SURFACE
@@ -398,8 +397,7 @@ class Smoothness:
 def _without(white: Whitened, fit: Fit, known: FittedCandidate | None) -> tuple[Whitened, int]:
     """Innovations as if a part were not there, its columns left out, and the number of parameters left."""
     names = [fit.model.parameters[place].name for place in fit.model.free]
-    amplitudes = () if known is None else known.candidate.amplitudes
-    mine = [names.index(name) for name in amplitudes]
+    mine = [names.index(name) for name in (() if known is None else known.candidate.amplitudes)]
     smooth = None if known is None else known.candidate.smooth
     linear = mine if smooth is None else mine[: smooth.linear]
     values = fit.model.values[[fit.model.free[place] for place in linear]]

@@ -485,7 +485,6 @@ def _most_telling(structure: Structure, roles: Roles) -> tuple[tuple[str, ...], 
         there = set(equations) <= set(curve.term.targets)
         if there and curve.term.words[0] in others and curve.gain >= share * best.gain:
             return curve.term.targets, curve.term.words[0]
-    excess = structure.total - structure.freedom
-    if len(own) > len(equations) and best.gain < NEARLY_ALL * excess:
+    if len(own) > len(equations) and best.gain < NEARLY_ALL * (structure.total - structure.freedom):
         return equations, ", ".join(own)
     return equations, coordinate

@@ -112,8 +112,7 @@ class Budget:
 
     def part(self, share: float) -> AbstractContextManager[None]:
         """Work that may take a share of what is left, and no more: one fit does not take all of it."""
-        left = min(self.work, self._limit) - self.spent
-        return self._limited(self.spent + share * max(left, 0.0))
+        return self._limited(self.spent + share * max(min(self.work, self._limit) - self.spent, 0.0))
 
     def account(self) -> Account:
         """An account until now, as a verdict records it."""

@@ -42,8 +42,7 @@ class ClosedFunctions:
     """f of a model with the effect of a spread of the state; methods as of `ParametricFunctions`."""
 
     def __init__(self, model: Dynamics) -> None:
-        d = model.dimension
-        self._pairs = [(j, k) for j in range(d) for k in range(j + 1)]
+        self._pairs = [(j, k) for j in range(model.dimension) for k in range(j + 1)]
         names = [f"_spread_{j}_{k}" for j, k in self._pairs]
         equations = []
         for formula in model.equations:

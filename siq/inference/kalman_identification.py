@@ -156,8 +156,7 @@ def identify_by_likelihood(
         fit = observation.fitted(support, values, data, noise=fit.noise, x=fit.linearised_at)
         if slow:
             observation = _with_time_of(fit, observation, data)
-        scores = np.abs(fit.model.values) / fit.standard_errors
-        return fit, scores[: len(places)] / critical[places]
+        return fit, (np.abs(fit.model.values) / fit.standard_errors)[: len(places)] / critical[places]
 
     fit, support = fit_significant(fit_terms, support)
     if by_state:

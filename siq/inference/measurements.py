@@ -117,8 +117,7 @@ class Measurements:
             a jump within a step of an integration then acts as it should, and the lag has a derivative.
         """
         wide = np.broadcast_to(width, t.shape)
-        count = len(self.courses[0]) if self.courses else 0
-        inputs = np.empty((count, len(t)))
+        inputs = np.empty((len(self.courses[0]) if self.courses else 0, len(t)))
         delayed, slopes = np.empty((len(delays), len(t))), np.empty((len(delays), len(t)))
         bounds = np.searchsorted(recording, np.arange(len(self.labels) + 1))
         for place, courses in enumerate(self.courses):
@@ -178,8 +177,7 @@ def course_of_input(t: np.ndarray, u: np.ndarray, interpolation: str) -> scipy.i
         raise Fault("a band-limited input is sampled irregularly", "resample it, or call it linear")
     padding = min(PADDING, len(u) - 1)
     # Mirrored through its end points the signal goes on without a jump and without a kink.
-    left = 2 * u[0] - u[padding:0:-1]
-    longer = np.concatenate([left, u, 2 * u[-1] - u[-2 : -padding - 2 : -1]])
+    longer = np.concatenate([2 * u[0] - u[padding:0:-1], u, 2 * u[-1] - u[-2 : -padding - 2 : -1]])
     line = np.linspace(longer[0], longer[-1], len(longer))
     dense = scipy.signal.resample(longer - line, OVERSAMPLING * len(longer))
     dense_t = t[0] + step.mean() * (np.arange(len(dense)) / OVERSAMPLING - padding)

@@ -109,8 +109,7 @@ def smoothed_motion(data: Measurements, names: Sequence[str]) -> tuple[np.ndarra
     rate = (data.outputs[begins + 1] - data.outputs[begins]) / data.step[begins, None]
     velocity[begins] = rate
     begin = FIRST_FORCE * (rate**2).mean(axis=0) / float(np.median(data.step[begins]))
-    process = np.diag(np.append(0 * begin, begin))
-    noise = Noise.of_rate(data.with_known_noise(data.roughness), process)
+    noise = Noise.of_rate(data.with_known_noise(data.roughness), np.diag(np.append(0 * begin, begin)))
     x = np.concatenate([data.outputs, velocity], axis=1)
     fit = fit_by_filter(free, data, x=x, noise=noise, closure=False)
     if fit.fault:
@@ -436,8 +435,7 @@ def inertia_test(
     )  # fmt: skip
     if shown and (test.seen or not limit):
         return test
-    least = models.least_friction(best.log_likelihood, friction)
-    return replace(test, friction=least, friction_error=None)
+    return replace(test, friction=models.least_friction(best.log_likelihood, friction), friction_error=None)
 
 
 class _InertialModels:

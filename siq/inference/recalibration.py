@@ -84,8 +84,7 @@ def covariance_with_unknown_process_noise(
     )  # fmt: skip
     if not forced.converged or not forced.has_process_noise:
         return covariance
-    free = np.array(fit.model.free, dtype=int)
-    apart = (forced.model.values - fit.model.values)[free]
+    apart = (forced.model.values - fit.model.values)[np.array(fit.model.free, dtype=int)]
     return _average(forced, data, forced.noise.process, budget)[0] + np.outer(apart, apart)
 
 
@@ -346,8 +345,7 @@ def recalibrate(model: Dynamics, data: Measurements, *, budget: Budget | None = 
     again = fitted(strict.model, x=strict.x, noise=small, estimate_process=True, substeps=strict.substeps)
     strict = _with_insignificant_dropped(again, strict, data)
     loosened = [each for each in (known, again) if each is not None and each.converged]
-    best = max(loosened, key=lambda each: each.log_likelihood, default=None)
-    return _simpler_fit(best, strict), strict
+    return _simpler_fit(max(loosened, key=lambda each: each.log_likelihood, default=None), strict), strict
 
 
 def fit_before_rounding(

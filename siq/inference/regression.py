@@ -363,8 +363,7 @@ def _refuse_forgotten(pairs: SnapshotPairs | StreamedPairs) -> None:
         np.concatenate([np.ones((len(one), 1)), one.x0, one.xh], axis=1) for one in pairs.blocks()
     )
     d = len(found) // 2
-    ends = np.linalg.qr(found[1:, 1 + d :])[0]
-    last = float(np.linalg.svd(ends[:d], compute_uv=False)[-1])
+    last = float(np.linalg.svd(np.linalg.qr(found[1:, 1 + d :])[0][:d], compute_uv=False)[-1])
     count = len(pairs) / pairs.copies
     if erfc(np.sqrt(-count * np.log1p(-(min(last, 1 - 1e-12) ** 2)) / 2)) > FORGOTTEN:
         raise NumericalFailure(

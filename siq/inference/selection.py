@@ -70,8 +70,7 @@ def critical_values(library: CandidateLibrary, *, false_terms: float) -> np.ndar
     present, counts = np.unique(degrees, return_counts=True)
     shares = 1 / scipy.special.factorial(present)
     budget = false_terms * shares / shares.sum() / (counts * library.dimension)
-    each = budget[np.searchsorted(present, degrees)]
-    return np.asarray(-scipy.special.ndtri(each / 2))
+    return np.asarray(-scipy.special.ndtri(budget[np.searchsorted(present, degrees)] / 2))
 
 
 @dataclass(frozen=True)
@@ -179,8 +178,7 @@ def strong_terms(
     active = np.flatnonzero(present if among is None else present & among)
     while len(active):
         chosen = problem.columns[:, active]
-        size = np.linalg.norm(chosen, axis=0)
-        orthogonal, upper = np.linalg.qr(chosen / size)
+        orthogonal, upper = np.linalg.qr(chosen / np.linalg.norm(chosen, axis=0))
         strength = np.abs(scipy.linalg.solve_triangular(upper, orthogonal.T @ problem.goal))
         if precision is None:
             errors = np.linalg.norm(scipy.linalg.solve_triangular(upper, np.eye(len(active))), axis=1)

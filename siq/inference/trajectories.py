@@ -280,8 +280,7 @@ class _NormalEquations:
         expected: tuple[np.ndarray, np.ndarray],
     ) -> None:  # fmt: skip
         along = replace(along, gap=np.zeros_like(along.gap))
-        noise = Noise(variance, np.zeros(along.gap.shape[1]))
-        white = along.filtered(data.first, data.step, noise)[0]
+        white = along.filtered(data.first, data.step, Noise(variance, np.zeros(along.gap.shape[1])))[0]
         dimension, parameters, recordings = along.gap.shape[1], along.response.shape[2], len(data.labels)
         self.shared, self.shared_target = np.zeros((parameters, parameters)), np.zeros(parameters)
         self.own = np.zeros((recordings, dimension, dimension))
@@ -320,8 +319,7 @@ class _NormalEquations:
         change = np.linalg.pinv(reduced, rcond=SINGULAR, hermitian=True) @ rest
         begin = np.einsum("rde,re->rd", inverse, own_target - np.einsum("rpd,p->rd", between, change))
         linear = float(change @ target + (begin * own_target).sum())
-        length = float(change @ change + (begin**2).sum())
-        return change / scale, begin / own_scale, linear + damping * length
+        return change / scale, begin / own_scale, linear + damping * float(change @ change + (begin**2).sum())
 
 
 SHORTEST_PREFIX = 8  # samples

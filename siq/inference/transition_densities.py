@@ -261,8 +261,7 @@ def _filtered(
 
 def _explained(scores: np.ndarray) -> float:
     """Twice what the likelihood gains by single scores ``(n, p)``, to second order: Rao's statistic."""
-    basis = np.linalg.qr(scores / positive(np.linalg.norm(scores, axis=0)))[0]
-    return float((basis.sum(axis=0) ** 2).sum())
+    return float((np.linalg.qr(scores / positive(np.linalg.norm(scores, axis=0)))[0].sum(axis=0) ** 2).sum())
 
 
 class Transitions:

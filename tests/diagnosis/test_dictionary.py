@@ -265,7 +265,7 @@ def test_a_sign_is_lost_only_where_the_simulation_has_one() -> None:
     assert dict(probe.shapes) == {name: 1.0}
     assert not tried(candidate, replace(data, outputs=x - 0.5))
     assert not tried(replace(candidate, model=candidate.begun(model, {"g": 0.0})), data)
-    # Fits that follow the recordings have lost it; the simulation that runs by itself has it, and the numbers.
+    # Fits that follow the recordings have lost it; the simulation that runs by itself has it, and values.
     fit, _ = recalibrate(model, data)
     known, states = probe.begin(fit, data, fit.x)
     assert known == pytest.approx({"g": 0.4, "d": 0.3, name: 1.0}, rel=0.02)
