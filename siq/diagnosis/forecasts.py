@@ -571,14 +571,14 @@ def _next_rung(
     # Friction of two kinds is not fitted where one of them promises nearly as much.
     less = {k: [most.get((n, one.coordinate), -np.inf) for n in one.generalises] for k, one in named.items()}
     order = [k for k in named if max(less[k], default=-np.inf) < NEARLY_ALL * gains[k]]
-    # A state of its own follows the motion. That is bent one sample ahead, where forces at random have to do
-    # what the state would: behind a gear with play the motor seems to wait whenever it turns.
-    far, promise = _gains(horizons[-1:], places, None, budget, untried)
-    ahead = far[int(np.argmax(promise + np.array([site.prior for site in far])))]
     # A sensor without a sign bends the motion until it is seen; what was fitted cannot show it.
     for site in places:
         if site.candidate is not None and any(each.magnitude_of for each in site.candidate.searches):
             attempt(site)
+    # A state of its own follows the motion. That is bent one sample ahead, where forces at random have to do
+    # what the state would: behind a gear with play the motor seems to wait whenever it turns.
+    far, promise = _gains(horizons[-1:], places, None, budget, untried)
+    ahead = far[int(np.argmax(promise + np.array([site.prior for site in far])))]
     own_states = ahead.candidate is not None and ahead.candidate.model.dimension > base.model.dimension
     if own_states and ahead.label not in {sites[k].label for k in order if gains[k] > 0}:
         for term in ahead.terms:
