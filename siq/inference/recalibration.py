@@ -252,7 +252,7 @@ def fit_with_and_without_process_noise(
 
 def _missed_without(loose: Fit, data: Measurements) -> float:
     """Mean square of the errors that a fit would have without its process noise, if all were linear."""
-    if not (loose.converged and loose.has_process_noise):
+    if not loose.has_process_noise:
         return 0.0
     try:
         white = whiten(loose.linearisation, data, loose.noise.without_process())
