@@ -25,7 +25,7 @@ from siq.errors import NumericalFailure
 from siq.inference.budget import Budget, BudgetSpent, evaluation
 from siq.inference.kalman_filter import Grid, Linearisation, Whitened, linearise, profile_likelihood, whiten
 from siq.inference.maximum_likelihood import Fit
-from siq.inference.measurements import Measurements
+from siq.inference.measurements import Measurements, first_states
 from siq.inference.trajectories import EDGE_SUBSTEPS, fit_trajectories, run, run_along, spread_edges
 from siq.systems.dynamics import Dynamics, Tape
 from siq.systems.formulas import compile_values
@@ -100,11 +100,11 @@ class Probe:
         for name, search in zip(candidate.shapes, candidate.searches, strict=True):
             found = places_of(search, data, model, x)
             if search.magnitude_of is not None and len(found):
-                formula = dict(candidate.model.outputs)[search.magnitude_of]
-                given = run(candidate.model, Grid(data, EDGE_SUBSTEPS), x[data.first[:-1]])
-                simulated = along([formula], candidate.model, data, given)
-                noise = np.sqrt(data.roughness[model.output_names.index(search.magnitude_of)])
-                found = found[: int((simulated < -4 * noise).any())]
+                column = model.output_names.index(search.magnitude_of)
+                begin = first_states(model, data)[data.first[:-1]]
+                given = run(candidate.model, Grid(data, EDGE_SUBSTEPS), begin)
+                simulated = along([candidate.model.outputs[column][1]], candidate.model, data, given)
+                found = found[: int((simulated < -4 * np.sqrt(data.roughness[column])).any())]
             choices = [(*before, (name, float(place))) for before in choices for place in found]
         return [cls(candidate, shapes) for shapes in choices]
 
@@ -188,11 +188,14 @@ class Probe:
         if any(search.magnitude_of for search in self.candidate.searches):
             model = self.candidate.begun(self.candidate.model, known)
             first, grid, off = data.first[:-1], Grid(data, fit.substeps), []
-            for begin in (x[first], -x[first]):
-                shown = along([h for _, h in model.outputs], model, data, run(model, grid, begin)).T
+            begin = first_states(fit.model, data)[
+                first
+            ]  # a fit may have led states that nobody sees anywhere
+            for either in (begin, -begin):
+                shown = along([h for _, h in model.outputs], model, data, run(model, grid, either)).T
                 squares = np.where(np.isfinite(data.outputs), (shown - data.outputs) ** 2, 0.0)
                 off.append(np.add.reduceat(squares / fit.noise.measurement, first).sum(axis=1))
-            begin = np.where(off[1] < off[0], -1.0, 1.0)[:, None] * x[first]
+            begin = np.where(off[1] < off[0], -1.0, 1.0)[:, None] * begin
             free = fit_trajectories(model, data, begin=begin, noise=fit.noise, substeps=fit.substeps)
             return {each.name: each.value for each in free.model.parameters}, free.x
         if not self.candidate.scales:

@@ -188,8 +188,7 @@ def plot_quasipotential(
     """
     shown = summarise(landscape, recordings)
     axes = new_axes() if ax is None else ax
-    handles = _draw_quasipotential(axes, shown, states=states, view=view)
-    return with_legend(axes, handles, legend=legend)
+    return with_legend(axes, _draw_quasipotential(axes, shown, states=states, view=view), legend=legend)
 
 
 @drawn_in_style
