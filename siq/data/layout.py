@@ -391,8 +391,7 @@ def _with_stated_times(source: ColumnFile) -> ColumnFile:
     """A table of which no column tells the time, with the times that a stated rate or interval gives."""
     stated, places = SAMPLING.fullmatch(source.sampling), range(len(source.headings))
     unit = (stated["before"] or stated["after"]) if stated else None
-    named = any(read_heading(one).may_be_time for one in source.headings)
-    if stated is None or unit is None or named:
+    if stated is None or unit is None or any(read_heading(one).may_be_time for one in source.headings):
         return source
     if any(
         _runs_evenly(_numbers(source, at)) or _tells_time(source.headings[at], source, at) for at in places

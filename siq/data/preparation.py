@@ -631,8 +631,7 @@ def repetitions(recordings: Recordings, column: int) -> list[tuple[float, str, f
     # A stretch is another one by chance where each of its steps is.
     begins = np.arange(len(x) - COPIED + 1)
     begins = begins[which[begins] == which[begins + COPIED - 1]]
-    weights = np.random.default_rng(0).standard_normal(COPIED)
-    marks = np.convolve(x - x.mean(), weights, mode="valid")[begins]
+    marks = np.convolve(x - x.mean(), np.random.default_rng(0).standard_normal(COPIED), mode="valid")[begins]
     moved = np.ptp(x[begins[:, None] + np.arange(COPIED)], axis=1) > ALIKE * size
     count = int(moved.sum()) - len(np.unique(marks[moved]))
     alike = min(width / (2 * np.sqrt(np.pi) * size), 1.0) ** (COPIED - 1)

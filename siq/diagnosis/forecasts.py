@@ -28,6 +28,7 @@ from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
+import sympy
 from scipy.special import logsumexp
 
 from siq.data.correlation import correlation_time_of
@@ -52,7 +53,7 @@ from siq.inference.kalman_filter import Noise, Whitened, whiten
 from siq.inference.maximum_likelihood import Fit, first_noise, fit_by_multiple_shooting
 from siq.inference.measurements import Measurements
 from siq.inference.recalibration import fit_with_process_noise_as_needed
-from siq.inference.trajectories import EDGE_SUBSTEPS, spread_edges
+from siq.inference.trajectories import EDGE_SUBSTEPS, fit_trajectories, spread_edges
 from siq.numerics.randomness import positive
 from siq.systems.dynamics import Dynamics
 
@@ -237,6 +238,13 @@ def _fitted(
     if not fit.converged and (shown.measurement > noise.measurement).any():
         other = fit_by_multiple_shooting(model, data, noise=noise, **known)
         fit = max(other, fit, key=lambda each: (each.converged, each.log_likelihood))
+    if not fit.converged and any(formula.has(sympy.Abs) for _, formula in model.outputs):
+        # What reads the same either way goes to and fro where it was led to the wrong side.
+        free = fit_trajectories(
+            fit.model, data, begin=states[data.first[:-1]], noise=fit.noise, substeps=substeps, budget=budget
+        )
+        other = fit_by_multiple_shooting(free.model, data, noise=shown, **(known | {"x": free.x}))
+        fit = max(other, fit, key=lambda each: each.log_likelihood)
     if fit.fault:
         raise NumericalFailure(fit.fault)
     return fit

@@ -177,8 +177,7 @@ def _path_nodes(problem: PathProblem, y: np.ndarray) -> np.ndarray:
     p[1:-1] = (middle[1:] + turn[1:] + middle[:-1] - turn[:-1]) / 2
     p[0] = middle[0] + turn[0] if problem.begin is None else problem.begin.slope(y[0]) / 2
     p[-1] = middle[-1] - turn[-1] if problem.finish is None else -problem.finish.slope(y[-1]) / 2
-    values = problem.level(y[:1]) + np.r_[0.0, np.cumsum(parts.actions)]
-    return np.column_stack([y, p, values])
+    return np.column_stack([y, p, problem.level(y[:1]) + np.r_[0.0, np.cumsum(parts.actions)]])
 
 
 def _extrapolated(

@@ -438,8 +438,7 @@ def grown(
 
     def close(points: np.ndarray) -> np.ndarray:
         """Mask of the saddles that points of a fit have reached."""
-        distances = [np.abs((points - top) / width).max(axis=1).min() for top in tops]
-        return np.array(distances) < SADDLE_DISTANCE
+        return np.array([np.abs((points - top) / width).max(axis=1).min() for top in tops]) < SADDLE_DISTANCE
 
     values = along(coefficients)
     residual, points, last, recorded = np.inf, np.zeros((0, len(attractor))), False, 0.0
@@ -580,8 +579,7 @@ def _with_slopes(well: Well, x: np.ndarray, other: Well, path: MinimumActionPath
     for points, gradients, weight in parts:
         root, along = noise.root_at(points), well.basis.gradients(points)
         rows.append(np.einsum("n,nij,nim->njm", weight, root, along[:, :, free], optimize=True))
-        off = gradients - along @ well.coefficients
-        rest.append(np.einsum("n,nij,ni->nj", weight, root, off).ravel())
+        rest.append(np.einsum("n,nij,ni->nj", weight, root, gradients - along @ well.coefficients).ravel())
     matrix = np.concatenate([one.reshape(-1, one.shape[2]) for one in rows])
     scale = positive(np.linalg.norm(matrix, axis=0))
     coefficients = well.coefficients.copy()

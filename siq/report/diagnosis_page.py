@@ -455,8 +455,7 @@ def _escape_times(escape: pd.DataFrame) -> pd.DataFrame | None:
     if len(names) == 2:
         pivot["changed by a factor"] = pivot[names[1]] / pivot[names[0]]
     pivot.columns.name = None
-    words = texts("tables")["simulations"]
-    return pivot.rename(columns={**words, "transition": "way out", "intensity": "ε"})
+    return pivot.rename(columns={**texts("tables")["simulations"], "transition": "way out", "intensity": "ε"})
 
 
 def _candidates(findings: Findings) -> pd.DataFrame | None:

@@ -169,8 +169,7 @@ def reference_table(*, points: int = 100) -> pd.DataFrame:
         own |= {"by": None, "to": None}
         if each.quasipotential is not None:
             lower, upper = each.dynamics.box.T
-            drawn = scipy.stats.qmc.Halton(len(lower), scramble=False).random(points)
-            at = lower + (upper - lower) * drawn
+            at = lower + (upper - lower) * scipy.stats.qmc.Halton(len(lower), scramble=False).random(points)
             values = compile_formulas([each.quasipotential], each.dynamics.symbols)(at.T)[0]
             rows += [
                 own | {"quantity": "U", "at": list(x), "value": value, "error": 0.0, "how": "exact"}

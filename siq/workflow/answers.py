@@ -119,8 +119,7 @@ class Provenance:
         for text in filter(None, content.split(b"\n")):
             try:
                 line = json.loads(text)
-                digest = line.pop("digest")
-                whole = digest == _digest(json.dumps(line, sort_keys=True).encode())
+                whole = line.pop("digest") == _digest(json.dumps(line, sort_keys=True).encode())
                 jobs += [line] if whole else []
             except (ValueError, KeyError, AttributeError):
                 whole = False

@@ -334,8 +334,7 @@ def landscape_of_run(
     outcome = Outcome(number, Step.LANDSCAPE, status, "; ".join(found.notes))
     note = record.diffusion_source.note
     if note is not None:
-        remark = Remark("quasipotential.reason", {"reason": note})
-        found = replace(found, remarks=(*found.remarks, remark))
+        found = replace(found, remarks=(*found.remarks, Remark("quasipotential.reason", {"reason": note})))
     # The attractors of both steps are those of one f: where they differ in number, indices mean nothing.
     if visits and max(one.well for one in visits) < len(found.attractors):
         found = replace(found, visits=visits)

@@ -358,8 +358,7 @@ def check_states(study: Study, states: Sequence[str], *, file: str) -> None:
     try:
         if study.recordings is not None and study.recordings.diffusion is not None:
             rows = diffusion_rows(study.recordings.diffusion, len(states))
-            noise = Diffusion.of_rows([symbol(name) for name in states], rows)
-            if not noise.regular:
+            if not Diffusion.of_rows([symbol(name) for name in states], rows).regular:
                 raise Fault("the noise does not reach every state", "give a positive definite matrix")
     except Fault as error:
         raise error.at(file, "recordings.diffusion") from None

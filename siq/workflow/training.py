@@ -147,8 +147,7 @@ def _fingerprint(settings: PipelineSettings, runs: Runs, data: Mapping[int, Trai
         record = runs[number][1]
         arrays = [part.training.x0, part.training.xh, part.training.h]
         if record is not None:
-            noise = record.diffusion.at(part.training.x0[:1])
-            arrays += [record.coefficients, record.covariance, noise]
+            arrays += [record.coefficients, record.covariance, record.diffusion.at(part.training.x0[:1])]
         for values in arrays:
             digest.update(np.ascontiguousarray(values).tobytes())
     return digest.hexdigest()
