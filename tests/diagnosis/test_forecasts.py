@@ -39,6 +39,7 @@ from siq.diagnosis.forecasts import (
     _on_top,
     _Rung,
     _Site,
+    _sites,
     _takes_most,
     _thinned,
     climb,
@@ -544,6 +545,28 @@ def test_another_shape_is_begun_with_where_the_best_one_leads_nowhere(
     monkeypatch.setattr(forecasts, "_gains", lambda horizons, sites, *_: (sites, np.ones(len(sites))))
     _next_rung(horizons, context.candidates, context, {})
     assert len(begun) == 2 and begun[0] != begun[1] and len(begun[0]) == 1
+
+
+@pytest.mark.parametrize(
+    ("unsettled", "gain", "horizons"), [(None, 1.0, 2), (1, 1.0, 2), (0, 1.0, 2), (0, -1.0, 1), (1, -1.0, 2)]
+)
+def test_a_fit_has_to_settle_one_sample_ahead(
+    unsettled: int | None, gain: float, horizons: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Farther ahead few samples tell of the parameters, and what was reached counts."""
+    context = context_of(pendulum(), recorded(0.15, 0.2), ("linear damping",))
+    fit, _ = recalibrate(context.model, context.data)
+    untried: dict[str, NotFitted] = {}
+    (site,) = (one for one in _sites(context.candidates, fit, context, untried) if one.candidate is not None)
+    before, fits, places = _horizons_of(fit, context)[:2], forecasts._fitted, itertools.count()
+    monkeypatch.setattr(
+        forecasts, "_fitted",
+        lambda *given, **known: replace(fits(*given, **known), converged=next(places) != unsettled),
+    )  # fmt: skip
+    monkeypatch.setattr(forecasts, "_gain_over", lambda *_: gain)
+    found = forecasts._fitted_at(before, site, context.budget, untried)
+    assert found is not None and len(found[0]) == horizons
+    assert (site.label in untried) == (unsettled == 0)
 
 
 def test_what_follows_any_motion_is_no_rival_where_something_simple_does_as_much(
