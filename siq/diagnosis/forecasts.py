@@ -512,7 +512,7 @@ def _fitted_at(
 ) -> tuple[list[Horizon], float] | None:
     """A mechanism fitted at every horizon, and what it gains; None where that fails.
 
-    It gains less than nothing if its sign is wrong. One not settled one sample ahead is among the untried, too.
+    It gains less than nothing if its sign is wrong. What does not settle one sample ahead is untried, too.
     """
     candidate, probe, found = site.candidate, site.terms[0], list[Horizon]()
     assert candidate is not None and isinstance(probe, Probe)
