@@ -300,10 +300,8 @@ def solve_case(
         same, on_lines = case.settings.search.same, None
         if (held := case.with_held_inputs()) is not None:
             with contextlib.suppress(*NUMERICAL_ERRORS, BudgetSpent):
-                lines, steps = (
-                    recalibrate(with_expectations(each.system), each.learn, budget=budget)[0]
-                    for each in (case, held)
-                )
+                both = ((with_expectations(each.system), each.learn) for each in (case, held))
+                lines, steps = (recalibrate(*each, budget=budget)[0] for each in both)
                 if steps.log_likelihood > lines.log_likelihood + same / 2:
                     case, on_lines = held, case
         found, shown, statement = _judged(case, budget)

@@ -499,6 +499,11 @@ class _Leader:
         """Logarithm of its probability, up to a constant."""
         return self.gain + self.site.prior
 
+    @property
+    def kind(self) -> tuple[str, int]:
+        """Its family, and how many parameters it brings."""
+        return self.candidate.family, len(self.candidate.new)
+
     def on_top(self, base: Dynamics, other: _Leader) -> _Site:
         """Its site on top of another mechanism of the same base, whose parameters may have the same names."""
         candidate, probe = self.candidate.rebased(base, other.candidate.model), self.site.terms[0]
@@ -516,8 +521,7 @@ def _fitted_at(
     """
     candidate, probe, found = site.candidate, site.terms[0], list[Horizon]()
     assert candidate is not None and isinstance(probe, Probe)
-    known = dict[str, float]()  # what the horizon before led to
-    folds, settled = any(search.magnitude_of for search in candidate.searches), False
+    known, settled = dict[str, float](), False  # what the horizon before led to
     for each in horizons:
         try:
             begun, x = probe.begin(each.fit, each.data, each.fit.x)
@@ -532,7 +536,7 @@ def _fitted_at(
             found.append(Horizon.of(fit, each.data))
             known |= {one.name: one.value for one in fit.model.parameters}
             # What jumps, or reads the same either way, may go to and fro.
-            settled = found[0].fit.converged or bool(found[0].fit.model.edges) or folds
+            settled = found[0].fit.converged or bool(found[0].fit.model.edges) or candidate.unsigned
             if not settled and _gain_over(found[:1], horizons[:1]) < 0:
                 break  # it leads nothing, and is no rival
         except NUMERICAL_ERRORS as error:
@@ -561,7 +565,7 @@ def _next_rung(
     places = _sites(candidates, base, context, untried)
     sites, gains = _gains(horizons, places, None, budget, untried)
     # The mechanisms that promise most, fitted at every horizon; those that foresee better than nothing.
-    fitted, leading = dict[str, _Leader](), list[_Leader]()
+    fitted, leading, outdone = dict[str, _Leader](), list[_Leader](), set[str]()
 
     def attempt(site: _Site, promise: float = np.inf) -> None:
         for term in site.terms:  # until one settles, or fails while others gain more than it promised
@@ -581,7 +585,7 @@ def _next_rung(
     order = [k for k in named if max(less[k], default=-np.inf) < NEARLY_ALL * gains[k]]
     # A sensor without a sign bends the motion until it is seen; what was fitted cannot show it.
     for site in places:
-        if site.candidate is not None and any(each.magnitude_of for each in site.candidate.searches):
+        if site.candidate is not None and site.candidate.unsigned:
             attempt(site)
     # A state of its own follows the motion. That is bent one sample ahead, where forces at random have to do
     # what the state would: behind a gear with play the motor seems to wait whenever it turns.
@@ -607,14 +611,13 @@ def _next_rung(
     # system swing by itself, and a delay of an input nearly as much as a lag.
     likely = max(leading, key=lambda each: each.weight).site if leading else None
     kin = None if likely is None or likely.label in free else likely.family[0]
-    delays = {k: e for k, e in named.items() if e.model.dimension > d and not e.amplitudes}
-    for place, one in delays.items():
-        if kin in (None, sites[place].family[0]) and one.label not in {*fitted, *untried}:
+    for place, one in named.items():
+        delay = one.model.dimension > d and not one.amplitudes
+        if delay and kin in (None, one.family) and one.label not in {*fitted, *untried}:
             attempt(sites[place])
     if not leading:
         return None
     alone = {site.label: site for site in sites if site.candidate is not None}
-    outdone = set[str]()
     if max(leading, key=lambda each: each.weight).candidate.model.dimension > d:
         # States of its own may follow any motion: what needs none is fitted first, whatever it promises.
         stateless = {each.label for each in candidates if each.model.dimension == d} - {*fitted, *untried}
@@ -651,9 +654,7 @@ def _next_rung(
         rebased = [each.rebased(base.model, there.model) for each in candidates]
         remaining = _sites(rebased, there, context, untried)
         # A lag in the place of a delay is no more than that.
-        kind, new = ground.candidate.family, len(ground.candidate.new)
-        likes = [e for e in plausible if e.candidate.family == kind and len(e.candidate.new) == new]
-        near = [each for each in plausible if each not in steady and each not in likes]
+        near = [each for each in plausible if each not in steady and each.kind != ground.kind]
         if near:
             # A state that follows the motion may be a simple mechanism and something simple at a time, or
             # what lasts of an error of the model, for which white noise is all that is allowed.
@@ -685,8 +686,7 @@ def _next_rung(
     if leader is ground:
         contained, equal = _containing(leader.horizons[0], sites, leader.candidate)
     else:  # a lag of what drives and one of what measures are the same to a linear system
-        ours = leader.site.family[0], len(leader.candidate.new)
-        equal = {k for k, each in fitted.items() if (each.site.family[0], len(each.candidate.new)) == ours}
+        equal = {label for label, each in fitted.items() if each.kind == leader.kind}
     # What has more parameters is no rival where it takes no more than it leaves of what the leader leaves.
     outdone |= {
         label

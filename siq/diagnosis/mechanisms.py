@@ -94,7 +94,7 @@ def places_of(search: Shape, data: Measurements, model: Dynamics, x: np.ndarray)
         if search.lattice_of is not None:
             found = resolution_step(values)
         elif search.magnitude_of is not None:
-            found = 1.0 if np.nanmin(values) >= -4 * np.sqrt(data.roughness[place]) else None
+            found = 1.0
         else:
             side = 1.0 if search.top_of is not None else -1.0
             top = _plateau(side * values, data.recording, noise=float(np.sqrt(data.roughness[place])))
@@ -183,6 +183,11 @@ class MechanismCandidate:
     place: Place | None = None  #: where a function stands
     #: What a curve or a surface is made of: the amplitudes are the heights of its bumps.
     smooth: SmoothFunction | None = None
+
+    @property
+    def unsigned(self) -> bool:
+        """Whether it takes the sign from what is measured."""
+        return any(search.magnitude_of for search in self.searches)
 
     @property
     def new(self) -> tuple[str, ...]:

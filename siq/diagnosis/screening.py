@@ -99,12 +99,13 @@ class Probe:
         choices: list[tuple[tuple[str, float], ...]] = [()]
         for name, search in zip(candidate.shapes, candidate.searches, strict=True):
             found = places_of(search, data, model, x)
-            if search.magnitude_of is not None and len(found):
+            if search.magnitude_of is not None:
                 column = model.output_names.index(search.magnitude_of)
                 begin = first_states(model, data)[data.first[:-1]]
                 given = run(candidate.model, Grid(data, EDGE_SUBSTEPS), begin)
                 simulated = along([candidate.model.outputs[column][1]], candidate.model, data, given)
-                found = found[: int((simulated < -4 * np.sqrt(data.roughness[column])).any())]
+                least, zero = np.nanmin(data.outputs[:, column]), -4 * np.sqrt(data.roughness[column])
+                found = found if least >= zero and (simulated < zero).any() else found[:0]
             choices = [(*before, (name, float(place))) for before in choices for place in found]
         return [cls(candidate, shapes) for shapes in choices]
 
@@ -185,12 +186,10 @@ class Probe:
         sign has lost it: there it begins with the simulation as given, fitted as it runs by itself.
         """
         known = dict(self.shapes)
-        if any(search.magnitude_of for search in self.candidate.searches):
+        if self.candidate.unsigned:
             model = self.candidate.begun(self.candidate.model, known)
             first, grid, off = data.first[:-1], Grid(data, fit.substeps), []
-            begin = first_states(fit.model, data)[
-                first
-            ]  # a fit may have led states that nobody sees anywhere
+            begin = first_states(fit.model, data)[first]  # those of the fit may be anywhere, where unseen
             for either in (begin, -begin):
                 shown = along([h for _, h in model.outputs], model, data, run(model, grid, either)).T
                 squares = np.where(np.isfinite(data.outputs), (shown - data.outputs) ** 2, 0.0)

@@ -397,7 +397,8 @@ class Smoothness:
 def _without(white: Whitened, fit: Fit, known: FittedCandidate | None) -> tuple[Whitened, int]:
     """Innovations as if a part were not there, its columns left out, and the number of parameters left."""
     names = [fit.model.parameters[place].name for place in fit.model.free]
-    mine = [names.index(name) for name in (() if known is None else known.candidate.amplitudes)]
+    amplitudes = () if known is None else known.candidate.amplitudes
+    mine = [names.index(name) for name in amplitudes]
     smooth = None if known is None else known.candidate.smooth
     linear = mine if smooth is None else mine[: smooth.linear]
     values = fit.model.values[[fit.model.free[place] for place in linear]]

@@ -107,7 +107,7 @@ def next_experiment(
 def _plans(fit: Fit, data: Measurements) -> tuple[list[Plan], Measurements, np.ndarray]:
     """Experiments with their samples, each as a recording, and their first states ``(experiments, d)``."""
     model, lengths = fit.model, np.diff(data.first)
-    count = min(int(lengths[int(lengths.argmax())]), MOST_SAMPLES)
+    count = min(int(lengths.max()), MOST_SAMPLES)
     step = float(np.median(data.step[data.begins]))
     t, seen = step * np.arange(count), np.stack([fit.x.min(axis=0), fit.x.max(axis=0)])
     limits = np.where(np.isfinite(model.limits.T), model.limits.T, seen)
