@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from coverage import Coverage
 
 # Before torch and numpy start their threads: arrays this small take thrice as long on two as on one.
 os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
@@ -58,6 +59,8 @@ def pytest_collection(session: pytest.Session) -> None:
         for module, _ in MODULES.values():
             importlib.import_module(module)
         coverage.pause()
+        while (outer := Coverage.current()) is not None:  # pytest-cov 7.1 starts two in a worker
+            outer.stop()
 
 
 @pytest.hookimpl(wrapper=True)

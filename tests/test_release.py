@@ -16,6 +16,7 @@ from typing import Any
 import jsonschema
 import pytest
 import yaml
+from coverage import Coverage
 
 from benchmarks.mutation import MODULES
 from siq.errors import InputError
@@ -148,6 +149,12 @@ def test_ci_counts_branches_of_every_module_that_decides_and_has_a_floor() -> No
         r"^suite:.*\n\t(.*)", (ROOT / "Makefile").read_text(encoding="utf-8"), flags=re.MULTILINE
     )
     assert suite is not None and "--cov" in suite[1].split()
+
+
+def test_other_tests_are_not_slowed_down_by_it(request: pytest.FixtureRequest) -> None:
+    if set(request.config.getoption("cov_source", None) or ()) - {True}:
+        pytest.skip("`--cov=siq` counts in all tests")
+    assert Coverage.current() is None  # this is none of those of a module that decides
 
 
 def test_forms_ask_for_what_inspect_prints() -> None:
