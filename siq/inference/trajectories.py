@@ -385,6 +385,11 @@ def free_run(
     prefix = data.until(np.maximum(_prefixes(data, told), 2))
     x = _initial_states(model, prefix, noise=noise, substeps=substeps, usual=usual)
     states = run(model, Grid(data, substeps), x)
+    if not np.isfinite(states).all():  # a tank may empty that never did before
+        substeps = max(substeps, EDGE_SUBSTEPS)
+        spread = spread_edges(model, data, states, substeps=substeps)
+        if spread.edges != model.edges:
+            states = run(spread, Grid(data, substeps), x)
     signals = data.signals(data.t, data.recording, delays=model.lags(model.values))
     return np.asarray(model.functions.outputs(states.T, signals, model.values).T)
 
@@ -436,9 +441,9 @@ EDGE = 0.05  # width of a jump, in what its argument passes in a substep
 def spread_edges(model: Dynamics, data: Measurements, x: np.ndarray, *, substeps: int) -> Dynamics:
     """The model with its jumps, and its roots at zero, spread over about what arguments pass in a substep.
 
-    It is used along states ``(n, d)``, which are those of all samples of the data. A root stays what it is
-    where its argument does not come to zero, as that of the level in a tank which is never empty, and where
-    it goes further down, to where it has none.
+    It is used along states ``(n, d)``, which are those of all samples of the data, and NaN from where a
+    simulation ran away. A root stays what it is where its argument does not come to zero, as that of the
+    level in a tank which is never empty, and where it goes further down, to where it has none.
     """
     jumps = {one.args[0] for each in model.equations for one in each.atoms(sympy.sign)}
     arguments = sorted(jumps | {one.base for each in model.equations for one in roots_of(each)}, key=str)
@@ -455,8 +460,8 @@ def spread_edges(model: Dynamics, data: Measurements, x: np.ndarray, *, substeps
     edges = []
     for argument, course in zip(arguments, along, strict=True):
         course = np.broadcast_to(course, data.t.shape)
-        passed = float(np.sqrt(np.mean((course[rows + 1] - course[rows]) ** 2)))
-        if argument in jumps or abs(course.min()) <= passed:
+        passed = float(np.sqrt(np.nanmean((course[rows + 1] - course[rows]) ** 2)))
+        if argument in jumps or abs(np.nanmin(course)) <= passed:
             edges.append((argument, EDGE * passed / substeps + 1e-300))
     return replace(model, edges=tuple(edges))
 

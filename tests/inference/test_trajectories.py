@@ -33,6 +33,7 @@ from siq.inference.trajectories import (
     _NormalEquations,
     _run_side_by_side,
     fit_trajectories,
+    free_run,
     run,
     spread_edges,
 )
@@ -318,3 +319,26 @@ def test_an_input_that_was_recorded_as_a_staircase_is_held_between_samples() -> 
         assert course_of(smooth) == "joined"
     assert course_of(stairs, interpolation="linear") == "joined"
     assert course_of(np.sin(t / 7), interpolation="zero_order") == "held"
+
+
+def test_a_tank_that_empties_in_a_free_run_and_never_did_before_stays_empty() -> None:
+    card = {
+        "name": "tank", "time_unit": "s", "states": {"h": {"unit": "cm"}},
+        "inputs": {"u": {"unit": "cm/s", "interpolation": "zero_order"}},
+        "parameters": {"c": {"value": 0.2}}, "equations": {"h": "u - c*sqrt(h)"},
+    }  # fmt: skip
+    model, t = model_of(card), np.arange(0, 100, 0.5)
+    drained = np.clip(np.sqrt(4.0) - 0.1 * t, 0, None) ** 2  # from 4 cm: √h falls by c/2 a second
+    table = Recordings.from_frame(
+        pd.DataFrame({"recording": "a", "t": t, "h": drained, "u": 0.0}), columns=["h", "u"]
+    )
+    data = measurements(table, model)
+    assert not model.edges
+    seen = free_run(model, data, noise=Noise(np.array([1e-6]), np.zeros(1)), substeps=2)
+    np.testing.assert_allclose(seen[:, 0], drained, atol=0.01)
+    # Nothing helps what runs away for another reason.
+    explosive = model_of(card | {"equations": {"h": "c*h**3 + u"}})
+    ran = free_run(
+        explosive, measurements(table, explosive), noise=Noise(np.array([1.0]), np.zeros(1)), substeps=2
+    )
+    assert not np.isfinite(ran).all()
