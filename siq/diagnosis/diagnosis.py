@@ -258,9 +258,8 @@ def _judged(case: Comparison, budget: Budget) -> tuple[Investigation, HeldOutRun
     named = found.verdict.names and not found.process_noise
     # Tests of somebody else may be among the recordings held out, and decide nothing.
     incomplete = found.remainder.doubtful or found.search.fit.has_process_noise
-    without, augmented = shown.errors.error("without"), shown.errors.augmented
-    worse = without is not None and (augmented is None or augmented >= without)
-    if named and not case.settings.tests and (worse or (incomplete and not shown.errors.takes_most)):
+    refuted = shown.errors.no_better or (incomplete and not shown.errors.takes_most)
+    if named and refuted and not case.settings.tests:
         found = _withdrawn(found)
         shown = held_out_runs(found, case.kept)
     elif found.too_faint and _is_what_was_found(shown.described, found.search):

@@ -123,6 +123,23 @@ class HeldOutErrors:
         before = 1.0 if without is None else min(without, 1.0)
         return (before - self.augmented) / max(before - self.floor, 1e-300)
 
+    def typical(self, run: Run) -> float | None:
+        """The geometric mean of a simulation's errors in blocks; None where they are not known.
+
+        One that lands in another well, or on another tooth, is off from there on, however right it is.
+        """
+        blocks = self.squares.get(self.better_without if run == "without" else run)
+        return float(np.exp(0.5 * np.log(positive(np.array(blocks))).mean())) if blocks else None
+
+    @property
+    def no_better(self) -> bool:
+        """Whether what was found foresees no better than what lacks it, neither in the mean nor typically."""
+        without, blocks = self.error("without"), self.squares
+        if without is None or self.augmented is None:
+            return without is not None
+        typical = typically_better(blocks[self.better_without], blocks["augmented"]) if blocks else False
+        return self.augmented >= without and not typical
+
     @property
     def takes_most(self) -> bool:
         """Whether names take more than they leave of the squared errors, beyond the sensors' noise."""

@@ -571,12 +571,21 @@ def test_a_name_has_to_make_recordings_better_that_were_held_out(
     diagnosis = solved(tmp_path, recordings_of(lambda x, v, t: 0.4 + 0 * x), study=study)
     assert names(diagnosis) == ["constant bias"]
     monkeypatch.setattr("siq.diagnosis.diagnosis.investigate", lambda *_, **__: diagnosis.investigation)
-    for share, verdict in ((0.999, "missing physics"), (1.001, "unexplained")):
+    # One that lands elsewhere in the last third, and was right until then, is not refuted by that.
+    off = np.repeat([1.0, 1e-4], [4, 8])
+    for share, blocks, verdict in (
+        (0.999, 0.999, "missing physics"), (1.001, 1.001, "unexplained"), (1.001, off, "missing physics"),
+    ):  # fmt: skip
 
-        def runs(found: Investigation, kept: Measurements, share: float = share) -> HeldOutRuns:
+        def runs(
+            found: Investigation, kept: Measurements, share: float = share, blocks: Any = blocks
+        ) -> HeldOutRuns:
             shown = held_out_runs(found, kept)
-            augmented = share * (shown.errors.error("without") or 1.0)
-            return replace(shown, errors=replace(shown.errors, augmented=augmented))
+            errors = shown.errors
+            squares = dict(errors.squares) | {"augmented": tuple(blocks * np.ones(12) * 0.01)}
+            squares[errors.better_without] = (0.01,) * 12
+            augmented = share * (errors.error("without") or 1.0)
+            return replace(shown, errors=replace(errors, augmented=augmented, squares=squares))
 
         monkeypatch.setattr("siq.diagnosis.diagnosis.held_out_runs", runs)
         found, *_ = _judged(diagnosis.case, diagnosis.investigation.context.budget)

@@ -186,6 +186,18 @@ def test_missing_physics_without_a_gain_cannot_be_read_as_one():
     assert text.count("10.3 %") == 2
 
 
+def test_what_lands_elsewhere_from_some_time_on_is_told_by_its_typical_error():
+    errors = errors_with({"before": 0.103, "recalibrated": 0.103, "augmented": 0.110}, 0.001)
+    blocks = {
+        "before": (0.0106,) * 12,
+        "recalibrated": (0.0106,) * 12,
+        "augmented": (1e-6,) * 6 + (0.024,) * 6,
+    }
+    text = statement_from(3, MismatchVerdict.MISSING_PHYSICS, errors=replace(errors, squares=blocks)).sentence
+    assert "the typical error on recordings that it did not see falls from 10.3 %" in text
+    assert "In the mean it is 10.3 %" in text and "11.0 %" in text and "does not improve" not in text
+
+
 def test_a_parameter_shift_names_its_parameters_with_both_values():
     for number in CASES:
         statement = statement_from(number, MismatchVerdict.PARAMETER_SHIFT)
