@@ -835,6 +835,7 @@ RESIDENTS: Sequence[Resident] = (
     Resident("rate limit", "circuit", {"r": 0.25}),
     Resident("magnetic saturation", "coil", {"c": 0.4}),
     Resident("photoinhibition", "algae", {"h": 0.4}),
+    Resident("photoinhibition", "algae", {"h": 0.5, "k": 0.6}, "beyond a saturation"),
     Resident("limiting resource", "culture", {"w": 1.0}, "of m"),
     Resident("thermal radiation", "furnace", {"c": 2e-10, "d": 5.0}, "to surroundings"),
     Resident("thermal radiation", "kettle", {"c": 1e-9, "d": 6.0}, "to surroundings"),
