@@ -50,7 +50,7 @@ from siq.diagnosis.terms import Place, places_in, products_in
 from siq.errors import NumericalFailure
 from siq.inference.budget import Budget, BudgetSpent, evaluation
 from siq.inference.kalman_filter import Noise, Whitened, whiten
-from siq.inference.maximum_likelihood import Fit, first_noise, fit_by_multiple_shooting
+from siq.inference.maximum_likelihood import Fit, first_noise, fit_by_multiple_shooting, fit_of_states
 from siq.inference.measurements import Measurements
 from siq.inference.recalibration import fit_with_process_noise_as_needed
 from siq.inference.trajectories import EDGE_SUBSTEPS, fit_trajectories, spread_edges
@@ -161,8 +161,7 @@ class _Foreseen:
         others, rest = whole.sum(axis=0) - whole + damping, right.sum(axis=0) - right
         found = np.linalg.solve(others, rest[:, :, None])[:, :, 0]
         learned = squares.sum() - squares - np.einsum("fp,fp->f", found, rest)
-        freedom = np.maximum(count.sum() - count - p - k, 1.0)
-        variance = np.maximum(learned, 1e-12 * squares.sum()) / freedom
+        variance = np.maximum(learned, 1e-12 * squares.sum()) / np.maximum(count.sum() - count - p - k, 1.0)
         missed = squares - 2 * np.einsum("fp,fp->f", found, right)
         missed += np.einsum("fp,fpq,fq->f", found, whole, found)
         return -0.5 * (np.maximum(missed, 0.0) / variance + count * np.log(variance))
@@ -479,6 +478,11 @@ class _Rung:
     log_odds: float  #: of its family, against all other explanations together
     flat_log_odds: float  #: the same, if all mechanisms are as likely beforehand, with a name or without
 
+    def placed(self, candidate: MechanismCandidate, horizons: Sequence[Horizon]) -> _Rung:
+        """It in other fits, with the evidence that it has where it is."""
+        best = replace(self.accepted.best, candidate=candidate, fit=horizons[0].fit)
+        return replace(self, accepted=replace(self.accepted, best=best), horizons=tuple(horizons))
+
 
 @dataclass(frozen=True, eq=False)
 class _Leader:
@@ -557,9 +561,13 @@ def _gain_over(one: Sequence[Horizon], other: Sequence[Horizon]) -> float:
 
 def _next_rung(
     horizons: Sequence[Horizon], candidates: Sequence[MechanismCandidate], context: FitContext,
-    untried: dict[str, NotFitted],
+    untried: dict[str, NotFitted], on_trial: list[_Rung] | None = None, asked: str = "",
 ) -> _Rung | None:  # fmt: skip
-    """The mechanism that stands first on top of fits; None where none is likelier than what has no name."""
+    """The mechanism that stands first on top of fits; None where none is likelier than what has no name.
+
+    Then the one that comes first all the same is put on trial, where a list for that is given. One that is
+    asked for, by its label, is fitted whatever it promises.
+    """
     options, base, budget = context.study.search, horizons[0].fit, context.budget
     budget.says("comparing forecasts of what was left out")
     places = _sites(candidates, base, context, untried)
@@ -585,7 +593,7 @@ def _next_rung(
     order = [k for k in named if max(less[k], default=-np.inf) < NEARLY_ALL * gains[k]]
     # A sensor without a sign bends the motion until it is seen; what was fitted cannot show it.
     for site in places:
-        if site.candidate is not None and site.candidate.unsigned:
+        if site.label == asked or (site.candidate is not None and site.candidate.unsigned):
             attempt(site)
     # A state of its own follows the motion. That is bent one sample ahead, where forces at random have to do
     # what the state would: behind a gear with play the motor seems to wait whenever it turns.
@@ -721,6 +729,12 @@ def _next_rung(
     likelier = (weights > leader.weight + options.least_log_odds) & (leader.gain < NEARLY_ALL * gains)
     general = np.array([site.candidate is None for site in sites]) & family & likelier
     if log_odds < options.least_log_odds or general.any():
+        if on_trial is not None:
+            each = max(leading, key=lambda each: each.weight)
+            fit, data, blocks = each.horizons[0].fit, horizons[0].data, options.blocks
+            whole = FittedCandidate.of(fit, base, data, each.candidate, blocks=blocks)
+            nothing = AcceptedMechanism(whole, {"same": (), "less": ()})
+            on_trial.append(_Rung(nothing, tuple(each.horizons), log_odds, flat_log_odds))
         return None
     members = {sites[k].label: weights[k] for k in np.flatnonzero(family) if sites[k].candidate is not None}
     alike = {label for label, weight in members.items() if weight > leader.weight + np.log(PLAUSIBLE)}
@@ -790,8 +804,7 @@ def _needed(
 def _exchanged(found: list[_Rung], alone: Sequence[Horizon], context: FitContext) -> list[_Rung]:
     """A climb with a mechanism exchanged for one that was not told apart from it, where that foresees better.
 
-    A delay and a lag may look alike as long as friction is missing, too. What is exchanged comes last: it may
-    bring a state of its own, on which no other mechanism is put.
+    A delay and a lag may look alike as long as friction is missing, too. What is exchanged comes last.
     """
     for place, rung in enumerate(found[:-1]):
         best, same = rung.accepted.best, rung.accepted.others["same"]
@@ -814,9 +827,9 @@ def _exchanged(found: list[_Rung], alone: Sequence[Horizon], context: FitContext
 def _on_top(horizons: Sequence[Horizon], rung: _Rung, context: FitContext) -> _Rung | None:
     """The mechanism of a rung fitted on top of other fits; None where it does not settle there."""
     base, label = horizons[0].fit, rung.accepted.best.candidate.label
-    if base.model.dimension > context.model.dimension:
-        return None
     (plain,) = (each for each in context.candidates if each.label == label)
+    if min(base.model.dimension, plain.model.dimension) > context.model.dimension:
+        return None
     candidate = plain.rebased(context.model, base.model)
     for probe in Probe.along(candidate, base, context.data):
         failed, site = dict[str, NotFitted](), _Site((probe,), 0.0, 0.0, ("", ()), candidate)
@@ -826,6 +839,28 @@ def _on_top(horizons: Sequence[Horizon], rung: _Rung, context: FitContext) -> _R
             whole = FittedCandidate.of(fit, base, context.data, candidate, blocks=blocks)
             return replace(rung, accepted=replace(rung.accepted, best=whole), horizons=tuple(fitted[0]))
     return None
+
+
+def _below(rung: _Rung, context: FitContext) -> _Rung | None:
+    """A rung without the one that it was found on, where both led: without it a fit may run away."""
+    best, found = rung.accepted.best, list[Horizon]()
+    (plain,) = (each for each in context.candidates if each.label == best.candidate.label)
+    names = dict(zip(plain.new, best.candidate.new, strict=True))
+    try:
+        for each in rung.horizons:
+            known = {parameter.name: parameter.value for parameter in each.fit.model.parameters}
+            values = [known[names.get(p.name, p.name)] for p in plain.model.parameters]
+            d, own = context.model.dimension, plain.model.dimension - context.model.dimension
+            x = np.hstack([each.fit.x[:, :d], each.fit.x[:, each.fit.x.shape[1] - own :]])
+            model, noise = plain.model.with_values(np.array(values)), each.fit.noise.of_states(x.shape[1])
+            fit = fit_of_states(
+                model, each.data, x=x, noise=noise, substeps=each.fit.substeps, converged=False
+            )
+            found.append(Horizon.of(fit, each.data))
+    except NUMERICAL_ERRORS as error:
+        LOGGER.info("%s alone: %s", plain.label, error)
+        return None
+    return rung.placed(plain, found)
 
 
 def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[_Rung], list[NotFitted], list[_Rung]]:
@@ -841,26 +876,48 @@ def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[_Rung], li
     judged, and what was taken back.
     """
     model, found, untried = context.model, list[_Rung](), dict[str, NotFitted]()
-    alone, budget = list[Horizon](), context.budget
+    alone, budget, together = list[Horizon](), context.budget, False
+
+    def next_on(below: Sequence[_Rung], on_trial: list[_Rung] | None = None, asked: str = "") -> _Rung | None:
+        horizons = below[-1].horizons if below else alone
+        base = horizons[0].fit.model
+        remaining = [
+            each.rebased(model, base) if below else each
+            for each in context.candidates
+            if not any(each.repeats(other.accepted.best.candidate) for other in below)
+            and min(base.dimension, each.model.dimension) == model.dimension
+        ]
+        return _next_rung(horizons, remaining, context, untried, on_trial, asked)
+
+    def together_with(first: _Rung) -> list[_Rung]:
+        """The two that are certain beside each other, where neither is alone."""
+        second = next_on([first])
+        below = None if second is None else _below(second, context)
+        own = first.accepted.best.candidate
+        again = None if below is None else next_on([below], asked=own.label)
+        if second is None or below is None or again is None:
+            return []
+        found = again.accepted.best.candidate
+        if found.label == own.label:
+            return [again.placed(own, first.horizons), second]
+        return [below, again] if _kind_of(found, model) == _kind_of(own, model) else []
+
     try:
         with budget.part(FIRST_NAME_SHARE):
-            horizons = alone = _horizons_of(fit, context)
+            alone = _horizons_of(fit, context)
         while len(found) < context.study.search.mechanisms:
-            base = horizons[0].fit.model
-            if base.dimension > model.dimension:
-                break
-            remaining = [
-                each.rebased(model, base) if found else each
-                for each in context.candidates
-                if not any(each.repeats(other.accepted.best.candidate) for other in found)
-            ]
+            on_trial = list[_Rung]()
             with budget.part(1.0 if found else FIRST_NAME_SHARE):
-                rung = _next_rung(horizons, remaining, context, untried)
-            if rung is None:
+                rung = next_on(found, on_trial)
+                rungs = [rung] if rung is not None else []
+                if on_trial and not found:
+                    rungs = together_with(on_trial[0])
+                    together = bool(rungs)
+            if not rungs:
                 break
-            LOGGER.info("found %s by forecasts", rung.accepted.best.candidate.label)
-            found.append(rung)
-            horizons = list(rung.horizons)
+            for each in rungs:
+                LOGGER.info("found %s by forecasts", each.accepted.best.candidate.label)
+            found += rungs
         found = _exchanged(found, alone, context)
     except (*NUMERICAL_ERRORS, BudgetSpent) as error:
         LOGGER.info("forecasts end: %s", error)
@@ -872,8 +929,10 @@ def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[_Rung], li
     while (last := len(found)) and not _takes_most(
         errors(last - 1), errors(last), fits[last], context.data, surely=False
     ):
-        back.append(found.pop())
         LOGGER.info("%s makes no free run better", own[last - 1].label)
+        back.append(found.pop())
+        if together and last == 2:
+            back.append(found.pop())
     own, last = own[: len(found)], len(found)
     # So may a general form whose special case is enough beside what came after it.
     needless = {e.label for e in own[:-1] if e.generalises or not _needed(e, fits[last], own, context)}

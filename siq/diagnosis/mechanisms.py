@@ -209,33 +209,37 @@ class MechanismCandidate:
 
     def rebased(self, before: Dynamics, now: Dynamics) -> MechanismCandidate:
         """It on top of a model that has grown since."""
-        model, renamed = self.model, {name: name for name in self.new}
-        taken = {parameter.name for parameter in now.parameters}
-        for name in (each for each in self.new if each in taken):
+        model, d = self.model, before.dimension
+        further = model.states[d:]
+        renamed, taken = {name: name for name in (*self.new, *further)}, set(now.names)
+        for name in (each for each in renamed if each in taken):
             (renamed[name],) = fresh_names(name.rpartition("_")[0], 1, {*taken, *renamed.values()})
         change = {symbol(old): symbol(new) for old, new in renamed.items() if old != new}
 
         def merged(theirs: sympy.Expr, old: sympy.Expr, ours: sympy.Expr) -> sympy.Expr:
             return ours + (theirs - old).xreplace(change)
 
-        rows = itertools.zip_longest(
-            model.equations, before.equations, now.equations, fillvalue=sympy.Integer(0)
-        )
+        rows = zip(model.equations[:d], before.equations, now.equations[:d], strict=True)
         measured = zip(model.outputs, before.outputs, now.outputs, strict=True)
         new = (replace(p, name=renamed[p.name]) for p in model.parameters[len(before.parameters) :])
-        return replace(
-            self,
-            model=replace(
-                model,
-                equations=tuple(merged(*each) for each in rows),
-                outputs=tuple((name, merged(t, o, n)) for (name, t), (_, o), (_, n) in measured),
-                parameters=(*now.parameters, *new),
+        grown = replace(
+            model, states=(*now.states, *(renamed[name] for name in further)),
+            units=(*now.units, *model.units[d:]), domain=np.concatenate([now.limits, model.limits[d:]]),
+            diffusion=now.diffusion.extended(len(further)),
+            equations=(
+                *(merged(*each) for each in rows), *now.equations[d:],
+                *(each.xreplace(change) for each in model.equations[d:]),
             ),
-            changes=tuple((name, formula.xreplace(change)) for name, formula in self.changes),
+            outputs=tuple((name, merged(t, o, n)) for (name, t), (_, o), (_, n) in measured),
+            parameters=(*now.parameters, *new),
+        )  # fmt: skip
+        changes = ((renamed.get(name, name), formula.xreplace(change)) for name, formula in self.changes)
+        return replace(
+            self, model=grown, changes=tuple(changes),
             amplitudes=tuple(renamed[name] for name in self.amplitudes),
             shapes=tuple(renamed[name] for name in self.shapes),
             positive=frozenset(renamed[name] for name in self.positive),
-        )
+        )  # fmt: skip
 
     def columns(self, model: Dynamics) -> list[tuple[int, int, sympy.Expr]]:
         """What a unit of each amplitude, none being there yet, does to the equations and outputs of a model.

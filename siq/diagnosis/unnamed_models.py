@@ -438,9 +438,7 @@ def fit_models_of_remainder(named: Search, whole: Search, context: FitContext) -
     base, data = named.fit, context.data
 
     def on_top(parts: tuple[FittedCandidate, ...], fit: Fit) -> list[AugmentedModel]:
-        if fit.model.dimension > named.recalibrated.model.dimension or not has_structure(fit, data):
-            return []
-        return _with_function(parts, fit, context)
+        return _with_function(parts, fit, context) if has_structure(fit, data) else []
 
     parts = _terms_of(whole, context)[len(named.found) :]
     fits = [each.best.fit for each in whole.found[len(named.found) :]]

@@ -25,7 +25,7 @@ from siq.diagnosis.screening import Probe, screen_all
 from siq.diagnosis.study import SearchOptions, _measurements_of
 from siq.inference.measurements import Measurements
 from siq.inference.recalibration import recalibrate
-from siq.systems.dynamics import Dynamics, _without_teeth
+from siq.systems.dynamics import Dynamics, _without_teeth, symbol
 
 OSCILLATOR = {
     "time_unit": "s",
@@ -338,6 +338,21 @@ def test_each_mechanism_is_among_those_that_are_fitted(name: str) -> None:
 def the(name: str, home: str, label: str = "") -> MechanismCandidate:
     """The candidate of a name in a home."""
     return next(each for each in candidates(HOMES[home].model) if each.name == name and label in each.label)
+
+
+def test_mechanisms_add_up_in_any_order_also_those_that_bring_a_state() -> None:
+    model, wall = HOMES["hut"].model, the("hidden capacity", "hut", "next to u")
+    others = {each.name: each for each in candidates(model) if each.model.dimension == model.dimension}
+    assert len(others) > 3
+    for other in others.values():
+        for one, more in ((wall, other), (other, wall)):
+            both = more.rebased(model, one.model).model
+            assert both.states == wall.model.states
+            further = both.parameters[len(one.model.parameters) :]
+            fresh = {symbol(a): symbol(p.name) for a, p in zip(more.new, further, strict=True)}
+            for place, row in enumerate(model.equations):
+                added = one.model.equations[place] + (more.model.equations[place] - row).xreplace(fresh)
+                assert sympy.simplify(both.equations[place] - added) == 0, (one.label, more.label)
 
 
 def test_a_speed_by_itself_is_known_by_its_unit() -> None:
@@ -893,6 +908,13 @@ def test_light_is_best_at_its_own_strength() -> None:
     grown = the("photoinhibition", "algae").model.equations[0]
     h, u = (next(e for e in grown.free_symbols if e.name == k) for k in ("h_1", "u"))
     assert sympy.simplify(grown.diff(u).subs(u, 1 / h)) == 0
+
+
+def test_more_light_than_is_good_for_what_saturates_does_harm() -> None:
+    # Peeters and Eilers (1978): u/(a u² + b u + c), largest at √(c/a).
+    grown = the("photoinhibition", "algae", "beyond a saturation").model.equations[0]
+    k, u = (next(e for e in grown.free_symbols if e.name == name) for name in ("k_1", "u"))
+    assert sympy.simplify(grown.diff(u).subs(u, 1 / sympy.sqrt(k))) == 0
 
 
 def test_a_motor_goes_no_faster_than_it_can() -> None:

@@ -8,6 +8,7 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import pandas as pd
 import pytest
 from homes_of_mechanisms import (
     HOMES,
@@ -388,6 +389,40 @@ def test_what_came_first_is_exchanged_for_what_foresees_better_beside_the_rest(
     found = [first, rung(first.horizons, "linear damping")]
     names = [each.accepted.best.candidate.name for each in _exchanged(found, alone, context)]
     assert names == (["linear damping", truth] if truth == "actuator lag" else [truth, "linear damping"])
+
+
+def test_two_that_are_certain_only_beside_each_other_are_both_found() -> None:
+    """An oven that radiates, behind a thermocouple that lags: neither foresees much without the other."""
+    draw, t, h = np.random.default_rng(4), np.arange(0, 2000, 10.0), 0.5
+    tables = []
+    for place in range(2):
+        power, seen = np.repeat(draw.choice([0.0, 0.4, 0.8, 1.2, 1.6], 8), 25), np.empty((len(t), 2))
+        state = np.array([295.0, 295.0])
+        for row in range(len(t)):
+            seen[row] = state
+            for _ in range(20):
+                warm = 2.4 * power[row] - 0.0012 * (state[0] - 295) - 2.2e-12 * (state[0] ** 4 - 295**4)
+                state = state + h * np.array([warm, (state[0] - state[1]) / 35])
+        shown = seen[:, 1] + 0.7 * draw.normal(size=len(t))
+        tables.append(pd.DataFrame({"recording": f"r{place}", "t": t, "T": shown, "q": power}))
+    card = {
+        "time_unit": "s", "states": {"T": {"unit": "K"}},
+        "inputs": {"q": {"unit": "kW", "interpolation": "zero_order"}},
+        "parameters": numbers(a=0.003, b=2.5), "equations": {"T": "b*q - a*(T - 295)"},
+    }  # fmt: skip
+    model = model_of(card)
+    data = measurements(Recordings.from_frame(pd.concat(tables), columns=["T", "q"]), model)
+    some = ("thermal radiation", "sensor lag", "washout", "constant bias")
+    context = context_of(model, data, some)
+    assert first_rung(context) is None
+    _, found, *_ = climb(recalibrate(model, data)[0], context)
+    names = {each.accepted.best.candidate.name for each in found}
+    assert names == {"thermal radiation", "sensor lag"}
+    assert all(each.log_odds > context.study.search.least_log_odds for each in found)
+    fit = found[-1].accepted.best.fit
+    values = {parameter.name: parameter.value for parameter in fit.model.parameters}
+    assert values["tau_1"] == pytest.approx(35, rel=0.02) and values["b"] == pytest.approx(2.4, rel=0.01)
+    assert fit.model.states == ("T", "z_1")
 
 
 def test_a_general_form_whose_amplitude_is_zero_within_errors_is_its_special_case() -> None:
