@@ -352,8 +352,7 @@ def _fitted_shape(covariances: np.ndarray, count: float, *, seen: int) -> _Shape
     of_sensor = _increment_covariances(np.where(lags > 0, 2.0, 0.0))
 
     def fitted(kind: Kind, memory: float, sensor: bool) -> _Shape:
-        own = _increment_covariances(_displacement(kind, lags, memory))
-        parts = np.stack([own, of_sensor][: 1 + sensor])
+        parts = np.stack([_increment_covariances(_displacement(kind, lags, memory)), of_sensor][: 1 + sensor])
         design = (root @ parts[:, :, None])[:, :, 0].T
         scale = np.linalg.norm(design, axis=0)
         values, left = scipy.optimize.nnls(design / scale, goal)

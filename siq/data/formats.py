@@ -216,8 +216,7 @@ def _open_text(file: str) -> ColumnFile:
     # Tables put one below the other repeat their headings.
     if not unnamed and content.count(title.encode(), begin) > 1:
         first, *others = content[begin:].splitlines()
-        kept = [line for line in others if line.strip() != title.encode()]
-        content, begin = b"\n".join([first, *kept]), 0
+        content, begin = b"\n".join([first, *[line for line in others if line.strip() != title.encode()]]), 0
         lines = [lines[0], *(line for line in lines[1:] if line.strip() != title)]
     rows = [_split(line, separator) for line in lines[1:]]
     if unnamed:
@@ -336,8 +335,7 @@ def _preamble(lines: list[str], separator: str) -> int:
 def _split(line: str, separator: str) -> list[str]:
     if separator == " ":
         # "t (s)" is one heading, not two.
-        joined = re.sub(r"\s+(?=[\[(])", "\0", line.strip())
-        return [cell.replace("\0", " ") for cell in joined.split()]
+        return [cell.replace("\0", " ") for cell in re.sub(r"\s+(?=[\[(])", "\0", line.strip()).split()]
     return [cell.strip() for cell in next(csv.reader([line], delimiter=separator), [])]
 
 
@@ -482,8 +480,7 @@ class _Variable(NamedTuple):
         if values.dtype.kind not in "iuf":
             return values
         empty = [told[key] for key in ("_FillValue", "missing_value") if key in told]
-        packed = any(key in told for key in ("scale_factor", "add_offset"))
-        if not empty and not packed:
+        if not empty and not any(key in told for key in ("scale_factor", "add_offset")):
             return values
         numbers = np.where(np.isin(values, np.ravel(empty)), np.nan, values.astype(float))
         return np.asarray(numbers * told.get("scale_factor", 1.0) + told.get("add_offset", 0.0))
@@ -536,8 +533,7 @@ def _over_dimensions(file: str, variables: dict[str, _Variable]) -> ColumnFile:
         columns = {}
         for name in (names[position] for position in positions):
             own = several[name].dimensions
-            axes = [own.index(one) for one in order if one in own]
-            values = several[name].unpacked().transpose(axes)
+            values = several[name].unpacked().transpose([own.index(one) for one in order if one in own])
             values = values.reshape([sizes[one] if one in own else 1 for one in order])
             columns[name] = np.broadcast_to(values, tuple(sizes.values())).ravel()
         return _vectors(file, columns)

@@ -131,8 +131,7 @@ def _wells_apart(values: np.ndarray, runs: list[slice]) -> np.ndarray:
         place = int(least.argmin())
         if least[place] > FALSE_WELL:
             break
-        lower = place if depth[place, 0] < depth[place, 1] else place + 1
-        wells = np.delete(wells, lower, axis=0)
+        wells = np.delete(wells, place if depth[place, 0] < depth[place, 1] else place + 1, axis=0)
     return wells
 
 

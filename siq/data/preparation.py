@@ -614,8 +614,7 @@ def repetitions(recordings: Recordings, column: int) -> list[tuple[float, str, f
         if not len(changes):
             continue
         # Noise may be small in some states: how large it is in each twentieth of the samples, by their state.
-        rank = np.argsort(np.argsort(at, kind="stable"), kind="stable")
-        part = rank * min(STATE_PARTS, len(at)) // len(at)
+        part = np.argsort(np.argsort(at, kind="stable"), kind="stable") * min(STATE_PARTS, len(at)) // len(at)
         spread = np.sqrt(np.bincount(part, changes**2) / np.bincount(part))
         spread = np.maximum(spread, max(LEAST_SPREAD * float(spread.max()), 1e-300))
         sizes = np.abs(changes)

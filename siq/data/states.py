@@ -79,8 +79,7 @@ class DwellCount:
             inside, gaps = visits[run], np.diff(t[run])
             before, known = inside[:-1], inside[:-1] >= 0
             spent += np.bincount(before[known], weights=gaps[known], minlength=states)
-            hops = known & (inside[1:] != before)
-            ended += np.bincount(before[hops], minlength=states)
+            ended += np.bincount(before[known & (inside[1:] != before)], minlength=states)
         return tuple(cls(int(n), float(time)) for n, time in zip(ended, spent, strict=True))
 
     @property

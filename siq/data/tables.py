@@ -458,8 +458,7 @@ def _complete(
     whole = pd.Series(~np.isnan(numbers[:, rows.order]).any(axis=0))
     after = whole.groupby(rows.recording).cummax()
     before = whole[::-1].groupby(rows.recording[::-1]).cummax()
-    few = whole.groupby(rows.recording).transform("sum") < 2
-    keep = (after & before | few).to_numpy()
+    keep = (after & before | (whole.groupby(rows.recording).transform("sum") < 2)).to_numpy()
     if not keep.all():
         values = {"rows": int((~keep).sum()), "recordings": len(np.unique(rows.recording[~keep]))}
         remarks.append(Remark("data.rows_at_ends", values))
@@ -508,8 +507,7 @@ def _in_order(rows: _Rows, numbers: np.ndarray, labelled: bool, remarks: list[Re
     `labelled` says that the table itself tells where its recordings begin.
     """
     t = numbers[0]
-    inside = rows.recording[1:] == rows.recording[:-1]
-    if not (inside & (np.diff(t[rows.order]) <= 0)).any():
+    if not ((rows.recording[1:] == rows.recording[:-1]) & (np.diff(t[rows.order]) <= 0)).any():
         return rows
     bounds = np.searchsorted(rows.recording, np.arange(1, len(rows.labels)))
     parts, labels, was_sorted, twice, begun = [], [], 0, 0, 0

@@ -209,8 +209,7 @@ def averaged_evidence(
     for prior in priors:
         inner = np.eye(len(gram)) + gram @ prior
         sign, determinant = np.linalg.slogdet(inner)
-        explained = float(overlap @ (prior @ np.linalg.solve(inner, overlap)))
-        left = max(total - explained, 1e-12 * total)
+        left = max(total - float(overlap @ (prior @ np.linalg.solve(inner, overlap))), 1e-12 * total)
         value = float(-0.5 * determinant - 0.5 * freedom * np.log(left / total))
         values.append(value if sign > 0 else -np.inf)
     return float(scipy.special.logsumexp(values) - np.log(len(values)))
@@ -242,8 +241,7 @@ def evidences_by_size(
         return np.zeros(len(sizes)), np.zeros(len(sizes)), np.full(len(sizes), total)
     seen = (vectors.T @ overlap) ** 2
     scale = sizes[:, None] / told.sum()
-    explained = (scale * seen / (1 + scale * told)).sum(axis=1)
-    left = np.maximum(total - explained, 1e-12 * total)
+    left = np.maximum(total - (scale * seen / (1 + scale * told)).sum(axis=1), 1e-12 * total)
     gained = -0.5 * np.log1p(scale * told).sum(axis=1) - 0.5 * freedom * np.log(left / total)
     return gained, scale[:, 0], left
 

@@ -122,8 +122,7 @@ def _log_odds_of_a_name(fit: Fit, candidates: Sequence[MechanismCandidate], cont
     forms = Counter(each.name for each in context.candidates)
     chosen = sum(np.log(len(forms) * forms[each.name]) for each in candidates if forms[each.name])
     named = ours + np.log1p(-unnamed) - chosen
-    nameless = scipy.special.logsumexp(theirs) + np.log(unnamed) - np.log(len(theirs))
-    return float(named - nameless)
+    return float(named - (scipy.special.logsumexp(theirs) + np.log(unnamed) - np.log(len(theirs))))
 
 
 @dataclass(frozen=True)

@@ -148,8 +148,7 @@ class Remainder:
         # What is left is the excess that remains, or what a function of one coordinate still finds: where a
         # fit without process noise takes a misfit for noise, only the latter shows it.
         best = alone.curves[0] if alone.curves else None
-        systematic = 0.0 if best is None else best.gain - 2 * best.term.width
-        left = max(alone.total - alone.freedom, systematic, 0.0)
+        left = max(alone.total - alone.freedom, 0.0 if best is None else best.gain - 2 * best.term.width, 0.0)
         return cls(before, after, float(np.clip(1 - left / (before.total - before.freedom), 0.0, 1.0)))
 
 

@@ -238,8 +238,7 @@ class Probe:
             k1 = rate(z, first)
             k2 = rate(z + step / 2 * k1, middle)
             k3 = rate(z + step / 2 * k2, middle)
-            k4 = rate(z + step * k3, last)
-            after = z + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+            after = z + step / 6 * (k1 + 2 * k2 + 2 * k3 + rate(z + step * k3, last))
             nodes += [z, z + step / 2 * k2, after]
             z = after
         return nodes

@@ -91,15 +91,13 @@ class _Bumps:
         limits = np.stack([courses.min(axis=1), courses.max(axis=1)])
         if len(shares) == 1:
             (lower,), (upper,) = limits
-            count = int(np.ceil(1 / (BUMP_SPACING * shares[0]))) + 1
-            centres = np.linspace(lower, upper, count)[:most, None]
+            centres = np.linspace(lower, upper, int(np.ceil(1 / (BUMP_SPACING * shares[0]))) + 1)[:most, None]
         else:
             apart = BUMP_SPACING * np.sqrt(len(shares))
             scaled = courses / lengths[:, None]
             # So far apart, beginning in the middle of the points, each farthest from those before it.
             away = np.full(scaled.shape[1], np.inf)
-            middle = np.median(scaled, axis=1)[:, None]
-            chosen = [int(np.argmin(((scaled - middle) ** 2).sum(axis=0)))]
+            chosen = [int(np.argmin(((scaled - np.median(scaled, axis=1)[:, None]) ** 2).sum(axis=0)))]
             while most is None or len(chosen) < most:
                 away = np.minimum(away, ((scaled - scaled[:, chosen[-1:]]) ** 2).sum(axis=0))
                 farthest = int(np.argmax(away))
@@ -345,8 +343,7 @@ class Smoothness:
         if best is None or not best.deviation > 0:
             return None
         whole = np.concatenate(values)
-        mean = float(np.logaddexp.reduce(whole) - np.log(len(whole)))
-        return replace(best, log_evidence=mean - alone)
+        return replace(best, log_evidence=float(np.logaddexp.reduce(whole) - np.log(len(whole))) - alone)
 
     def function(self, *, product: bool = False, times: float = 1.0) -> SmoothFunction:
         """The function, or the likeliest product of two, with lengths that are longer by a factor."""

@@ -332,8 +332,7 @@ def _kendall_excess(states: np.ndarray, rows: Sequence[np.ndarray]) -> float:
     for own in rows:
         x = states[own]
         around = ((x - x.mean(axis=0)) ** 2).sum(axis=0)
-        apart = (np.diff(x, axis=0) ** 2).sum(axis=0) / positive(2 * around)
-        slow = np.clip(1 - apart, 0.0, 1.0 - 1e-9)
+        slow = np.clip(1 - ((np.diff(x, axis=0) ** 2).sum(axis=0) / positive(2 * around)), 0.0, 1.0 - 1e-9)
         excess += float(((1 + 3 * slow) ** 2 / (len(own) * (1 - slow**2))).sum())
     return excess
 

@@ -316,8 +316,7 @@ class ResidualLikelihood(_DiffusionLikelihood):
         for (i, j), rows in zip(entries, at, strict=True):
             for (k, m), columns in zip(entries, at, strict=True):
                 both = precision[:, i, k] * precision[:, j, m] + precision[:, i, m] * precision[:, j, k]
-                weight = half[i, j] * half[k, m] * both
-                left = self.functions[:, places[rows, 2]] * weight[:, None]
+                left = self.functions[:, places[rows, 2]] * (half[i, j] * half[k, m] * both)[:, None]
                 information[np.ix_(rows, columns)] = left.T @ self.functions[:, places[columns, 2]]
         return logarithm, score.sum(axis=0), information, score.T @ score
 

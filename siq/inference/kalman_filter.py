@@ -340,8 +340,7 @@ def _carried(
             state = after
         nodes = range(3 * first, 3 * first + len(places))
         signals = [grid.signals(node, delays) for node in nodes]
-        at = np.concatenate(places, axis=1)
-        by_state, by_parameter = drift.slopes(at, Signals.joined(signals), values)
+        by_state, by_parameter = drift.slopes(np.concatenate(places, axis=1), Signals.joined(signals), values)
         if columns is not None:
             further = [columns.rates(x, values, node) for x, node in zip(places, nodes, strict=True)]
             by_parameter = np.concatenate([by_parameter, np.concatenate(further, axis=2)], axis=1)
@@ -384,8 +383,7 @@ def _runge_kutta(
     k1 = rates(x, begin, values) if first is None else first
     k2 = rates(x + step / 2 * k1, middle, values)
     k3 = rates(x + step / 2 * k2, middle, values)
-    k4 = rates(x + step * k3, end, values)
-    after = x + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    after = x + step / 6 * (k1 + 2 * k2 + 2 * k3 + rates(x + step * k3, end, values))
     return after, k1, rates(after, end, values)
 
 

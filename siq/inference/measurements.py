@@ -289,8 +289,7 @@ def expectations(model: Dynamics, values: np.ndarray | None = None) -> tuple[np.
             rows.append(np.zeros((len(each.roots), len(free))))
             roots = np.sqrt(each.weight) * each.roots
             rows[-1][:, [free[each.names[place]] for place in mine]] = roots[:, mine]
-            known = [0.0 if name in free else fixed[name] for name in each.names]
-            middle.append(-roots @ np.array(known))
+            middle.append(-roots @ np.array([0.0 if name in free else fixed[name] for name in each.names]))
     together = np.concatenate(rows)
     return together, np.concatenate(middle) - together @ now
 

@@ -162,8 +162,7 @@ class ObservationModel:
             return all_coefficients(range(self.hidden_states, self.library.dimension), self.library.size)
         (x, z), terms = self.library.symbols, self.library.terms
         of_state = [(0, k) for k, term in enumerate(terms) if z not in term.free_symbols]
-        of_force = [(1, terms.index(one)) for one in ((x, z) if self.follows else (z,))]
-        return np.array([*of_state, *of_force])
+        return np.array([*of_state, *[(1, terms.index(one)) for one in ((x, z) if self.follows else (z,))]])
 
     @property
     def definitions(self) -> np.ndarray:

@@ -417,8 +417,7 @@ def noise_nonstationarity(fit: Fit, data: Measurements) -> float:
     Both have their intensities at their best; of forces that follow the motion at least half are in
     proportion to the square of its size.
     """
-    moved = (fit.x - fit.x.mean(axis=0)) / positive(fit.x.std(axis=0))
-    motion = (moved**2).mean(axis=1)
+    motion = (((fit.x - fit.x.mean(axis=0)) / positive(fit.x.std(axis=0))) ** 2).mean(axis=1)
     following = motion / motion.mean()
 
     def likelihood(weight: np.ndarray) -> float:

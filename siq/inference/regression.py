@@ -623,8 +623,7 @@ def weighted_triangle(
         squares += float(((whitening @ left[part][:, :, None]) ** 2).sum())
         return block.reshape(-1, p + 1)
 
-    triangle = stacked_triangle(map(rows, range(0, len(pairs.h), WEIGHTED_CHUNK)))
-    return triangle, squares / (len(pairs.h) * d)
+    return stacked_triangle(map(rows, range(0, len(pairs.h), WEIGHTED_CHUNK))), squares / (len(pairs.h) * d)
 
 
 def _identify_by_instruments(
@@ -649,8 +648,7 @@ def _identify_by_instruments(
         moved = regression.corrected(values, flow, None) * h
         values = (solution @ (directions.T @ moved)).T.ravel()
         flow = regression.flow(values, None, tolerance=1e-6)
-    rest = moved - regression.predicted(values) * h
-    variances = np.diag(pairs.long_run(rest) * pairs.copies)
+    variances = np.diag(pairs.long_run(moved - regression.predicted(values) * h) * pairs.copies)
     columns, goals = directions.T @ (regression.theta * pairs.h).T, directions.T @ moved
     critical = critical_values(library, false_terms=options.false_terms)
     problems = [

@@ -388,7 +388,6 @@ def stacked_triangle(blocks: Iterable[np.ndarray]) -> np.ndarray:
     """R of the QR decomposition of blocks of rows ``(n, c)``, at least one, below each other."""
     found: np.ndarray | None = None
     for block in blocks:
-        together = block if found is None else np.concatenate([found, block])
-        found = np.asarray(np.linalg.qr(together, mode="r"))
+        found = np.asarray(np.linalg.qr(block if found is None else np.concatenate([found, block]), mode="r"))
     assert found is not None
     return found

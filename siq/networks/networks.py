@@ -236,12 +236,10 @@ def mean_velocity(
             k1 = vector_field(x0)
             k2 = vector_field(x0 + h / 2 * k1)
             k3 = vector_field(x0 + h / 2 * k2)
-            k4 = vector_field(x0 + h * k3)
-            return (k1 + 2 * (k2 + k3) + k4) / 6
+            return (k1 + 2 * (k2 + k3) + vector_field(x0 + h * k3)) / 6
         case "symmetric", 2:
             return vector_field((x0 + xh) / 2)
         case "symmetric", 4:
             start, end = vector_field(x0), vector_field(xh)
-            middle = vector_field((x0 + xh) / 2 + h / 8 * (start - end))
-            return (start + 4 * middle + end) / 6
+            return (start + 4 * vector_field((x0 + xh) / 2 + h / 8 * (start - end)) + end) / 6
     raise Fault(f"there is no {kind} matching rule of order {order}", "use order 2 or 4")

@@ -90,8 +90,7 @@ class _RegressionResult:
 
 def highest_used(potential: np.ndarray, *, level: float | None) -> float:
     """τ: `level` above the smallest of the known values of V; without one, above `LOWER_SHARE` of them."""
-    top = np.nanquantile(potential, LOWER_SHARE) if level is None else np.nanmin(potential) + level
-    return float(top)
+    return float(np.nanquantile(potential, LOWER_SHARE) if level is None else np.nanmin(potential) + level)
 
 
 def points_below(potential: np.ndarray, *, level: float | None) -> np.ndarray:

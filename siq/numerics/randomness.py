@@ -60,8 +60,7 @@ def normal_draws(
     scale = positive(np.sqrt(np.diag(covariance)))
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
     root = vectors * np.sqrt(np.maximum(values, 0.0))
-    drawn = generator.standard_normal((count, len(mean)))
-    return np.asarray(mean + (drawn @ root.T) * scale)
+    return np.asarray(mean + (generator.standard_normal((count, len(mean))) @ root.T) * scale)
 
 
 def positive(sizes: np.ndarray) -> np.ndarray:

@@ -209,8 +209,7 @@ def _check_identity(candidate: Candidate, found: AnyField, options: CertificateO
     x, noise = candidate.points, found.diffusion
     flow = dynamics_of(found).drift(x)
     built = candidate.circulatory(x) - noise.push(x, candidate.gradients(x))
-    squares = noise.squared_speed(x, flow - built).mean()
-    value = float(np.sqrt(squares / noise.squared_speed(x, flow).mean()))
+    value = float(np.sqrt(noise.squared_speed(x, flow - built).mean() / noise.squared_speed(x, flow).mean()))
     limit = options.identity + STANDARD_ERRORS * _relative_error_of_drift(found, x, noise)
     return Verdict.of(value, limit, "V and g do not make up f")
 
@@ -441,8 +440,7 @@ def _lost_shares(
     same = np.abs((places[:, None] - places) / width).max(axis=3) < EQUILIBRIUM_MERGE_TOLERANCE
     same &= ~gone[:, None] & ~gone & ~np.eye(len(starts), dtype=bool)[:, :, None]
     # Whichever came from afar has jumped; both have where they come from equally far.
-    met = (same & (far[:, None] > far / 2)).any(axis=1)
-    return np.asarray((gone | met).mean(axis=1))
+    return np.asarray((gone | (same & (far[:, None] > far / 2)).any(axis=1)).mean(axis=1))
 
 
 def check_existence(found: FieldEstimate, portrait: PhasePortrait, *, seed: int = 0) -> Verdict:

@@ -164,8 +164,7 @@ class HamiltonianFlow(ScaledSystem):
         y, q, v, frames = self.parts(state)
         frames, upper = np.linalg.qr(frames)
         frames = frames * np.sign(np.diagonal(upper, axis1=1, axis2=2))[:, None, :]  # det X keeps its sign
-        flat = frames.reshape(len(state), 2 * self.dimension**2)
-        return np.concatenate([y, q, v[:, None], flat], axis=1)
+        return np.concatenate([y, q, v[:, None], frames.reshape(len(state), 2 * self.dimension**2)], axis=1)
 
 
 MAX_STEPS = 20_000  # numerical, a guard: a curve that takes more is stiff, or circles
@@ -252,8 +251,7 @@ class Fan:
             upper[at[predicted < self.values[at] - SHEET_MARGIN * self.level]] = True
         # Points are sorted along curves: whatever follows an upper point on its curve is upper too.
         count = np.cumsum(upper)
-        before_curve = np.r_[0, count][np.searchsorted(self.curve, self.curve)]
-        return count == before_curve
+        return count == np.r_[0, count][np.searchsorted(self.curve, self.curve)]
 
     def value_near(self, x: np.ndarray, *, sheet: np.ndarray, distance: float = 0.1) -> np.ndarray:
         """V at points ``(m, d)``, to second order from the nearest point of a sheet, see `lowest_sheet`.
@@ -350,8 +348,7 @@ def characteristics(
         if not len(running):
             break
         rates = flow.rates(states[running])
-        y_rate = flow.parts(rates)[0]
-        step = np.minimum(steps[running], spacing / np.maximum(norm(y_rate), 1e-300))
+        step = np.minimum(steps[running], spacing / np.maximum(norm(flow.parts(rates)[0]), 1e-300))
         step = np.minimum(step, time_limit - times[running])
         with np.errstate(all="ignore"):
             new, error = dormand_prince_step(flow.rates, states[running], step, first=rates)
@@ -372,8 +369,7 @@ def characteristics(
         y, q, *_ = flow.parts(states[running])
         resting = norm(q) < REST_RATIO * norm(y)
         ends[running[resting]] = End.REST
-        stalled = steps[running] < 1e-13 * time_limit
-        running = running[~(ended | late | resting | stalled)]
+        running = running[~(ended | late | resting | (steps[running] < 1e-13 * time_limit))]
     # The last states before the ends within a step: where its cubic ends, and just before and behind that.
     crossing = np.flatnonzero(last_steps)
     before, bracket = states[crossing], np.stack([np.zeros(len(crossing)), last_steps[crossing]])
@@ -497,8 +493,7 @@ def _between(fan: Fan, gap: float) -> np.ndarray:
         pairs = np.stack([order, np.roll(order, -1)], axis=1)
     else:  # edges of the facets of what the directions span on the sphere
         facets = ConvexHull(directions).simplices
-        size = facets.shape[1]
-        edges = np.concatenate([facets[:, [a, b]] for a in range(size) for b in range(a)])
+        edges = np.concatenate([facets[:, [a, b]] for a in range(facets.shape[1]) for b in range(a)])
         pairs = np.unique(np.sort(edges, axis=1), axis=0)
     ends = (fan.points[fan.last] - fan.attractor) @ fan.metric.T
     width = np.linalg.norm(ends[pairs[:, 0]] - ends[pairs[:, 1]], axis=1)

@@ -114,8 +114,7 @@ class ReactiveFlow(NamedTuple):
         met = np.where(inside[0], 0.0, np.where(np.any(inside[1:], axis=0), 1.0, np.nan))
         following, number = np.full(len(met), np.nan), np.cumsum(~np.isnan(met))
         for run in runs_of(recordings):
-            later = pd.Series(met[run]).bfill().to_numpy()
-            following[run], number[run] = later, number[run] + run.start
+            following[run], number[run] = pd.Series(met[run]).bfill().to_numpy(), number[run] + run.start
         between = np.isnan(met) & ~np.isnan(following)
         q, number = self.process.interpolated(self.committor)(x[:, between]), number[between]
         table = pd.DataFrame({"bin": np.minimum((q * TENTHS).astype(int), TENTHS - 1), "number": number})
@@ -458,8 +457,7 @@ class CellProcess:
         found = np.nan_to_num(given, nan=0.0)
         operator = self.rates
         if backwards:  # of the reversed process only ratios count: π_j L_ji, row by row
-            weights = sparse.diags(np.maximum(self.density, np.finfo(float).tiny))
-            operator = (weights @ operator).T.tocsr()
+            operator = (sparse.diags(np.maximum(self.density, np.finfo(float).tiny)) @ operator).T.tocsr()
         inner = operator[free][:, free]
         scale = 1 / np.maximum(-inner.diagonal(), np.finfo(float).tiny)
         into = -(operator[free] @ found) - np.broadcast_to(source, len(found))[free]
@@ -614,8 +612,7 @@ def _invariant_density(rates: sparse.csr_matrix, dimension: int) -> np.ndarray:
     # all others to it would have to be found.
     anew = RESTART_RATE * float(-rates.diagonal().min())
     renewed = (transposed - anew * sparse.identity(size)).tocsc()
-    started = _factorised(renewed, dimension)(np.full(size, -anew / size))
-    fixed = int(np.argmax(started))
+    fixed = int(np.argmax(_factorised(renewed, dimension)(np.full(size, -anew / size))))
     free = np.delete(np.arange(size), fixed)
     right = -np.asarray(transposed[free][:, [fixed]].todense()).ravel()
     found = np.ones(size)

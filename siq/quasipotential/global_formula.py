@@ -95,8 +95,7 @@ class GlobalFormula:
         response = np.einsum("ikj,jp->ikp", downhill, self.sensitivity)
         response[*found.support.T, np.arange(len(found.support))] += 1.0
         errors = np.sqrt(np.einsum("ikp,pr,ikr->ki", response, found.covariance, response))
-        values = library.evaluate(points)
-        size = np.sqrt((values**2).mean(axis=0))[:, None]
+        size = np.sqrt((library.evaluate(points) ** 2).mean(axis=0))[:, None]
         speed = np.sqrt((found.dynamics.drift(points) ** 2).mean(axis=0))[None, :]
         critical = float(-scipy.special.ndtri(false_terms / (2 * q * d)))
         weak = np.abs(circulatory) * size < precision * speed.max()
@@ -177,8 +176,7 @@ def refine_globally(
     inverse = _left_inverse(equation.jacobian(solution))
     response = -inverse @ _forcing(equation, solution, found)
     residual = equation.residual(solution)
-    freedom = max(len(residual) - len(inverse), 1)
-    misfit = float(residual @ residual) / freedom * (inverse @ inverse.T)
+    misfit = float(residual @ residual) / max(len(residual) - len(inverse), 1) * (inverse @ inverse.T)
     q, p = library.size, len(found.support)
     coefficients, sensitivities, covariance = np.zeros(q), np.zeros((q, p)), np.zeros((q, q))
     coefficients[basis.chosen] = solution

@@ -368,8 +368,7 @@ class HamiltonJacobi:
                 factor, lower = scipy.linalg.cho_factor(normal, check_finite=False)
                 diagonal = np.diag(factor)
                 if diagonal.min() > DIAGONAL_RATIO * diagonal.max():
-                    right = matrix.T @ -residual
-                    step = scipy.linalg.cho_solve((factor, lower), right, check_finite=False)
+                    step = scipy.linalg.cho_solve((factor, lower), matrix.T @ -residual, check_finite=False)
             except scipy.linalg.LinAlgError:
                 pass
             if step is None:  # directions that the points do not determine are left as they are

@@ -307,8 +307,7 @@ def _followed(problem: _HamiltonianProblem, curve: np.ndarray) -> PPoly:
 
 def _linear(problem: _HamiltonianProblem, last: np.ndarray) -> _States:
     """The way to a point close to A, were f linear: q = y there."""
-    metric = np.eye(problem.dimension)
-    states, times = unwound(problem.growth, metric, last, step=SPIRAL_STEP, level=START**2)
+    states, times = unwound(problem.growth, np.eye(problem.dimension), last, step=SPIRAL_STEP, level=START**2)
     return times, np.concatenate([states, states], axis=1).T
 
 
@@ -388,8 +387,7 @@ def _reversed_motion(problem: _HamiltonianProblem, beside: np.ndarray, far: np.n
     turned = dynamics.jacobian(x)[:, velocities[:, None], velocities]
     momenta[:, positions] = -np.gradient(pushed, step, axis=0) - np.einsum("nij,ni->nj", turned, pushed)
     states = np.concatenate([problem.scaled(x), problem.slopes(momenta)], axis=1).T
-    times = step * np.arange(1 - len(x), 1)
-    return times[::-REVERSED_PACE][::-1], states[:, ::-REVERSED_PACE][:, ::-1]
+    return (step * np.arange(1 - len(x), 1))[::-REVERSED_PACE][::-1], states[:, ::-REVERSED_PACE][:, ::-1]
 
 
 def _finished(problem: _HamiltonianProblem, solution: PPoly, tolerance: float) -> MinimumActionPath:

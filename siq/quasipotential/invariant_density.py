@@ -354,8 +354,7 @@ class SampledPotential:
         values = np.where(known, self.values, np.inf)
         around = np.ones((3,) * values.ndim)
         # What is outside the box is not known either, and whatever is in it may have come from there.
-        unknown = np.pad(~known, 1, constant_values=True)
-        part, parts = scipy.ndimage.label(unknown, around)
+        part, parts = scipy.ndimage.label(np.pad(~known, 1, constant_values=True), around)
         # Two cells wide, as U varies between the middle of a cell and the rim.
         near = scipy.ndimage.minimum_filter(np.pad(values, 1, constant_values=np.inf), 5, mode="nearest")
         rims = np.array([-np.inf, *np.atleast_1d(scipy.ndimage.minimum(near, part, np.arange(1, parts + 1)))])
@@ -384,8 +383,7 @@ class SampledPotential:
                 break
         lowest[~known] = np.maximum(lowest[~known], levels)
         # A cell is where f leads from its middle, or from the middle of a cell beside it.
-        least = scipy.ndimage.minimum_filter(lowest, footprint=around, mode="nearest")
-        return np.where(known, np.inf, least)
+        return np.where(known, np.inf, scipy.ndimage.minimum_filter(lowest, footprint=around, mode="nearest"))
 
     def density(self, coarse: SampledPotential, lowest: np.ndarray, *, intensity: float) -> _KnownDensity:
         """The density for one ε, in the unit of U.

@@ -495,8 +495,7 @@ class Landscape:
         NumericalFailure
             When the simulation fails.
         """
-        strength = self._strength(noise)
-        intensity, rows = strength.intensity, []
+        intensity, rows = self._strength(noise).intensity, []
         cores, laws = self._cores(intensity), self.dwell_times(noise=noise)
         system, box, shifts = self.dynamics, self._box, self.dynamics.shifts
         if system.periodic:

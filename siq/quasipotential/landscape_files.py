@@ -213,8 +213,7 @@ def landscape_from_data(data: Mapping[str, Any], dynamics: Dynamics) -> Landscap
         start = attractors[one["start"]]
         own = _read(one, TRANSITION) | {"turns": tuple(one.get("turns", ()))}
         cycle = start if isinstance(start, Cycle) else None
-        way = Transition(saddle=saddle, path=path, rate=rate, cycle=cycle, **own)
-        transitions.append(way)
+        transitions.append(Transition(saddle=saddle, path=path, rate=rate, cycle=cycle, **own))
     errors = [one["standard_errors"] for one in wells]
     return Landscape(
         dynamics, equilibria, attractors, np.array([one["basin"] for one in wells]),

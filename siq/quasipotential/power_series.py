@@ -397,8 +397,7 @@ def _cycle_coefficients(dynamics: Dynamics, cycle: Cycle, degree: int) -> np.nda
     """c_2 … c_K of `CycleFormula` at the points of a cycle, power by power."""
     count, period = len(cycle.points), cycle.period
     t = period * np.arange(count) / count
-    here = CycleFormula(dynamics, cycle, np.zeros((0, count)))
-    place, along, across, speed, bend = here._frame(t)
+    place, along, across, speed, bend = CycleFormula(dynamics, cycle, np.zeros((0, count)))._frame(t)
     s, normal = sympy.Symbol("s_", real=True), sympy.symbols("n_0 n_1", real=True)
     shift = {own: own + s * to for own, to in zip(dynamics.symbols, normal, strict=True)}
     formulas = [*dynamics.formulas, *(entry for row in dynamics.diffusion.formulas for entry in row)]

@@ -476,8 +476,7 @@ def _troubled(study: Study, results: StudyResults) -> pd.DataFrame | None:
     certificates = results.tables["certificates"]
     troubled = outcomes[outcomes["status"].isin([Status.FAILED, Status.WARNING])]
     # A warning of `refine` is a formula that is not certified: which tests refused it is said once, below.
-    uncertified = (troubled["step"] == Step.REFINE) & (troubled["status"] == Status.WARNING)
-    troubled = troubled[~uncertified]
+    troubled = troubled[~((troubled["step"] == Step.REFINE) & (troubled["status"] == Status.WARNING))]
     refused = certificates[(certificates["method"] == Method.REFINED) & ~certificates["passed"]]
     reasons = refused.groupby("run")["reason"].agg(lambda texts: "; ".join(dict.fromkeys(texts)))
     runs = rrmse[(rrmse["method"] == Method.REFINED) & ~rrmse["certified"]]["run"]

@@ -112,8 +112,7 @@ def follow(
             break
     order = np.argsort(np.concatenate(whose), kind="stable")
     last = np.cumsum(np.bincount(np.concatenate(whose), minlength=count)) - 1
-    first = np.append(0, last[:-1] + 1)
-    kept = np.round(np.linspace(first, last, states, axis=1)).astype(int)
+    kept = np.round(np.linspace(np.append(0, last[:-1] + 1), last, states, axis=1)).astype(int)
     return Descents(np.concatenate(passed)[order][kept], ends, escaped)
 
 
@@ -268,8 +267,7 @@ def _saddle_near(dynamics: Dynamics, x: np.ndarray, box: np.ndarray) -> Equilibr
     if one is None or one.unstable == 1:
         return one if one is not None and one.kind == "saddle" else None
     values, vectors = np.linalg.eig(dynamics.jacobian(one.position[None])[0] * width / width[:, None])
-    weakest = np.argmin(np.where(values.real > 0, values.real, np.inf))
-    along = vectors[:, weakest].real
+    along = vectors[:, np.argmin(np.where(values.real > 0, values.real, np.inf))].real
     along *= width / np.abs(along).max()
     for size, sign in itertools.product(SADDLE_OFFSETS, (1, -1)):
         other = beside(one.position + sign * size * along)
@@ -362,8 +360,7 @@ def basin_of(
     starts = starts[((starts > box[:, 0]) & (starts < box[:, 1])).all(axis=1)]
     close = follow(dynamics, starts, attractors, box=box)
     states = np.concatenate([recorded, close.paths[close.ends == index]])
-    spread = None if near is None else len(recorded)
-    return Basin(states, _chosen(states, center, width, generator), spread)
+    return Basin(states, _chosen(states, center, width, generator), None if near is None else len(recorded))
 
 
 def _chosen(

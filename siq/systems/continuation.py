@@ -198,8 +198,7 @@ class _Folds(_Equilibria):
         d, z, q = self.d, y[: self.count], y[self.count :]
         slopes = self.family.slopes(z)
         turned = np.einsum("ijk,j->ik", self.family.bends(z)[:, :d], q)
-        none = np.zeros((d, d))
-        return np.block([[slopes, none], [turned, slopes[:, :d]], [np.zeros(self.count), 2 * q]])
+        return np.block([[slopes, np.zeros((d, d))], [turned, slopes[:, :d]], [np.zeros(self.count), 2 * q]])
 
     def resolved(self, last: np.ndarray, y: np.ndarray) -> bool:
         return True

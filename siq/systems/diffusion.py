@@ -239,8 +239,7 @@ class Diffusion:
 
         Raises NumericalFailure where D has no inverse.
         """
-        whitened = (self.whitening_at(x) @ velocity[:, :, None])[:, :, 0]
-        return np.asarray((whitened**2).sum(axis=1))
+        return np.asarray(((self.whitening_at(x) @ velocity[:, :, None])[:, :, 0] ** 2).sum(axis=1))
 
     def positive_at(self, x: np.ndarray) -> np.ndarray:
         """Mask of the points ``(n, d)`` at which D is a covariance: shape ``(n,)``.

@@ -127,8 +127,7 @@ def distinct_roots(
         # Few starts may all be at rest: then it is the slopes of f that tell what is small.
         speed = np.nanmedian(np.linalg.norm(dynamics.drift(starts) / width, axis=1))
         rate = np.nanmedian(np.linalg.norm(dynamics.jacobian(x[:1]), axis=(1, 2)))
-        small = max(1e-9 * speed, 1e-12 * rate)
-        converged = np.linalg.norm(dynamics.drift(x) / width, axis=1) < small
+        converged = np.linalg.norm(dynamics.drift(x) / width, axis=1) < max(1e-9 * speed, 1e-12 * rate)
     found = list(known)
     # Zero but for what is left of Newton's last step reads better as zero.
     x = np.where(np.abs(x) < np.finfo(float).eps * width, 0.0, x)

@@ -266,13 +266,11 @@ def split_escapes(
     centers = np.stack([start.center, *(one.center for one in targets)])
     around = [one.cycle.points for one in (start, *targets) if one.cycle is not None]
     rates = np.linalg.eigvals(dynamics.jacobian(np.concatenate([centers, *around])))
-    own = rates[0] if start.cycle is None else start.cycle.eigenvalues
-    slowest = float(np.abs(own.real).min())
+    slowest = float(np.abs((rates[0] if start.cycle is None else start.cycle.eigenvalues).real).min())
     along = progress(centers.T)
     lowest, top = float(along[0]), float(along[1:].max())
     # E[τ] is off by 0.3 % where noise is additive. Elsewhere Heun's rule is of order one.
-    share = min(STEP, np.sqrt(STEP_ERROR / (HEUN * max(top - lowest, 1.0))))
-    step = share / float(np.abs(rates).max())
+    step = min(STEP, np.sqrt(STEP_ERROR / (HEUN * max(top - lowest, 1.0)))) / float(np.abs(rates).max())
     function = dynamics.drift_of_components
     draw = noise_source(dynamics, intensity=intensity, step=step, generator=generator)
 

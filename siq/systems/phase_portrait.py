@@ -184,8 +184,7 @@ def phase_portrait(dynamics: Dynamics, points: np.ndarray | None = None, *, seed
     width = positive(np.ptp(box, axis=1))
     if not recorded and not searched:
         # Of many independent states the mean is always about the same: some have all states high, or low.
-        alike = np.linspace(0, 1, DIAGONAL_STARTS)[:, None] * width + box[:, 0]
-        points = np.concatenate([points, alike])
+        points = np.concatenate([points, np.linspace(0, 1, DIAGONAL_STARTS)[:, None] * width + box[:, 0]])
     if searched and not np.isfinite(dynamics.drift(points)).all():
         raise NumericalFailure("f has no value in a part of the domain: choose one in which it has")
     rate = crossing_rate(dynamics, points, width)

@@ -66,8 +66,7 @@ class SimulationEntry:
                 step = self.interval / max(math.ceil(self.interval / step), 2)
         interval = self.interval
         if interval is None:
-            steps = RELAXED / slowest / self.pairs / step
-            interval = step * round(min(max(steps, 2.0), float(MOST_STEPS)))
+            interval = step * round(min(max(RELAXED / slowest / self.pairs / step, 2.0), float(MOST_STEPS)))
         return replace(self, pair_step=step, interval=interval)
 
     def options(self) -> SimulationOptions:
@@ -258,8 +257,7 @@ def _rates(dynamics: Dynamics) -> tuple[float, float]:
     relaxing = [
         -float(one.eigenvalues.real.max()) for one in find_equilibria(dynamics, x) if one.kind == "attractor"
     ]
-    slowest = min(relaxing, default=float(np.quantile(sizes, 1 - FASTEST)))
-    return fastest, max(slowest, 1e-6 * fastest)
+    return fastest, max(min(relaxing, default=float(np.quantile(sizes, 1 - FASTEST))), 1e-6 * fastest)
 
 
 def _round_down(value: float) -> float:

@@ -115,8 +115,7 @@ def _exact_barriers(
         slope = sympy.Matrix([quasipotential.diff(each) for each in symbols])
         circulation = sympy.Matrix(dynamics.formulas) + sympy.Matrix(noise.matrix) * slope / 2
         parts = (g.diff(each) for g, each in zip(circulation, symbols, strict=True))
-        divergence = sympy.expand(sum(parts, sympy.S.Zero))
-        divergence_free = bool(sympy.nsimplify(divergence, rational=True) == 0)
+        divergence_free = bool(sympy.nsimplify(sympy.expand(sum(parts, sympy.S.Zero)), rational=True) == 0)
     for way in ways:
         start, saddle, end = (
             scipy.optimize.root(

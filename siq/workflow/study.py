@@ -461,8 +461,7 @@ class PipelineSettings:
             raise Fault(
                 "networks know recorded states only, and velocities are hidden", "leave 'training' out"
             )
-        recorded = replace(self.identification, hidden_velocities=False)
-        object.__setattr__(self, "identification", recorded)
+        object.__setattr__(self, "identification", replace(self.identification, hidden_velocities=False))
 
     @property
     def methods(self) -> tuple[Method, ...]:

@@ -238,8 +238,7 @@ def _seeds(
         line = system.with_values(np.array(changed, dtype=float))
         for one in follow_branches(line, names[along], limits, known)[1]:
             if one.kind != "branch point":
-                place = np.array([one.value, value] if along == 0 else [value, one.value])
-                yield one.kind, place, one.state
+                yield one.kind, np.array([one.value, value] if along == 0 else [value, one.value]), one.state
 
 
 def _curve_rows(curves: Sequence[Branch]) -> list[dict[str, object]]:
@@ -279,8 +278,7 @@ def _exits(point: SweptPoint, index: int, number: Sequence[int], noise: float | 
     known = [way for way in mine if way.barrier is not None]
     if not known:
         # Beside a limit cycle, or another well, it can be left in an unknown way.
-        alone = len(point.wells) == 1 and not point.notes and not mine
-        if alone:
+        if len(point.wells) == 1 and not point.notes and not mine:
             return {"barrier": np.inf, "note": sentence(Remark("workflow.only_stable_state"))}
         told = "; ".join(dict.fromkeys(way.note for way in mine if way.note)) or "; ".join(point.notes)
         return {"note": told or sentence(Remark("workflow.no_way_out"))}

@@ -82,8 +82,7 @@ def verify(result: str | Path) -> Iterator[Finding]:
     else:
         study = Study.model_validate(asked)
         card = _source(kept, "score", "equations")
-        of = _of_equations if study.entrance == "equations" else _of_trajectories
-        yield from of(study, card, kept)
+        yield from (_of_equations if study.entrance == "equations" else _of_trajectories)(study, card, kept)
     yield _open("page")
     yield _open("logs")
 

@@ -239,8 +239,7 @@ def plot_described(
             if len(each["coordinates"]) > 1:
                 axes.set_title(f"the coefficient of ${name_label(each['coordinates'][1])}$", loc="left")
         else:
-            drawn = _draw_surface(axes, each["surface"])
-            figure.colorbar(drawn, ax=axes, label=where)
+            figure.colorbar(_draw_surface(axes, each["surface"]), ax=axes, label=where)
             first, second = each["surface"]["coordinates"]
             axes.set_xlabel(with_unit(first))
             axes.set_ylabel(with_unit(second))
@@ -384,8 +383,7 @@ def _shown(
 def _name(axes: Axes, diagnosis: Diagnosis, place: int, t: np.ndarray, what: str) -> None:
     system = diagnosis.case.system
     name, formula = system.outputs[place]
-    units = dict(zip(system.states, system.units, strict=True))
-    unit = units.get(str(formula), "1")
+    unit = dict(zip(system.states, system.units, strict=True)).get(str(formula), "1")
     largest = max(abs(limit) for limit in axes.get_ylim())
     axes.set_ylabel(scaled_label(axes.yaxis, f"{what}${name_label(name)}$", unit, largest))
     axes.set_xlabel(scaled_label(axes.xaxis, "$t$", system.time_unit, float(np.abs(t).max(initial=0.0))))
@@ -434,8 +432,7 @@ def plot_curves(
             for stage in ("before", "after")
         }
         _draw_curves(axes, stages)
-        first = equation.split(", ")[0]
-        unit = (units or {}).get(coordinate if coordinate != "amplitude" else first, "1")
+        unit = (units or {}).get(coordinate if coordinate != "amplitude" else equation.split(", ")[0], "1")
         unit = time_unit if coordinate == "t" else unit
         axes.set_xlabel(_coordinate_label(coordinate, unit))
         axes.set_ylabel(_missing_label(equation, units, time_unit).replace(" (", "\n("))

@@ -132,8 +132,7 @@ def _binned_residuals(dynamics: Dynamics, recordings: Recordings, place: int) ->
         pairs, some = given, slice(0, PAIRS)  # one after the other, as their noise is correlated
         along = given.earlier[some, place]
     x0, xh, h = pairs.x0[some], pairs.xh[some], pairs.h[some]
-    rate = fastest_rate(dynamics, x0, np.ptp(x0, axis=0))
-    steps = int(np.clip(np.ceil(h.max() * rate / ACCURACY), 1, 200))
+    steps = int(np.clip(np.ceil(h.max() * fastest_rate(dynamics, x0, np.ptp(x0, axis=0)) / ACCURACY), 1, 200))
     x = FlowMap(steps)(dynamics.drift_of_components, np.ascontiguousarray(x0.T), h)
     left = (xh[:, place] - x[place]) / h
     together = 1.0 if lag is None else _together(left, given.number[some], lag)
@@ -157,8 +156,7 @@ def _together(left: np.ndarray, number: np.ndarray, lag: int) -> float:
     """By how much the error of a mean is larger, since neighbours go together."""
     rest = np.where(np.isfinite(left), left - left[np.isfinite(left)].mean(), 0.0)[:, None]
     covariances = lagged_covariances(rest, number, lag)
-    share = float(long_run_covariance(covariances, lag)[0, 0] / covariances[0, 0, 0])
-    return float(np.sqrt(max(share, 1.0)))
+    return float(np.sqrt(max(float(long_run_covariance(covariances, lag)[0, 0] / covariances[0, 0, 0]), 1.0)))
 
 
 def _draw(axes: Axes, binned: pd.DataFrame, share: float, name: str, units: tuple[str, str]) -> list[Any]:

@@ -198,8 +198,7 @@ def quasipotential_figure(landscape: LandscapeSummary) -> Figure | None:
         return None
     one = len(landscape.names) == 1
     figure = Figure(figsize=(WIDTH, 3.6 if one else 4.5))
-    axes = figure.add_subplot()
-    handles = _draw_quasipotential(axes, landscape)
+    handles = _draw_quasipotential(figure.add_subplot(), landscape)
     places = [one.position[None] for one in landscape.wells]
     if landscape.points is not None:
         places.append(landscape.points[:: max(len(landscape.points) // 500, 1)])

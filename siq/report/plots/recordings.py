@@ -169,8 +169,7 @@ def _draw_record(axes: Axes, found: Inspection, state: int) -> None:
     if hops is not None and hops.supported and hops.state == recordings.titles[state]:
         for level in hops.levels:
             axes.axhline(level, color=BLACK, linestyle="--", linewidth=0.8)
-    time_unit = recordings.time_unit
-    axes.set_xlabel(f"time {unit_label(time_unit or '')}".strip())
+    axes.set_xlabel(f"time {unit_label(recordings.time_unit or '')}".strip())
     axes.set_ylabel(_labels(found)[state])
     shown = f"{len(chosen)} of {counted(len(counts), 'recording')}" if len(counts) > 1 else "the recording"
     axes.set_title(shown, loc="left")

@@ -170,8 +170,7 @@ def _map(
     table: pd.DataFrame, parameters: Sequence[str], units: Mapping[str, str], curves: pd.DataFrame | None
 ) -> Figure:
     """How many wells there are, and the lowest barrier among them, against two parameters."""
-    known = table.assign(one=(table["well"] >= 0).astype(float))
-    grid = known.groupby(["second_value", "value"])
+    grid = table.assign(one=(table["well"] >= 0).astype(float)).groupby(["second_value", "value"])
     count, lowest = grid["one"].sum().unstack(), grid["barrier"].min().unstack()
     figure = Figure(figsize=(COLUMN_WIDTH, 2.6 * PANEL))
     panels = figure.subplots(2, 1, sharex=True)

@@ -149,8 +149,7 @@ def plot_paths(
             seen.add(key)
     axes.axvline(0.0, color=GREY, linewidth=0.8, linestyle=(0, (2, 2)), zorder=0)
     axes.margins(y=0.15)
-    largest = max(abs(limit) for limit in axes.get_ylim())
-    name_energy(axes, shown, largest, "$U$ along the way")
+    name_energy(axes, shown, max(abs(limit) for limit in axes.get_ylim()), "$U$ along the way")
     unit = shown.units[0] if one_unit else ""
     what = "distance from the saddle" if one_unit else "distance from the saddle / size of the region"
     axes.set_xlabel(f"{what} ({unit_text(unit)})" if unit not in ("", "1") else what)
@@ -163,8 +162,7 @@ def _profile(
     """Distance along a way, zero at the saddle, and U: by the action uphill, by the formulas downhill."""
     up, down = way.uphill, way.downhill[1:]
     points = np.concatenate([up, down])
-    steps = np.linalg.norm(np.diff(points / scale, axis=0), axis=1)
-    along = np.concatenate([[0.0], np.cumsum(steps)])
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points / scale, axis=0), axis=1))])
     along = along - along[len(up) - 1]
     values = landscape.potential(points)
     bottom, beyond = landscape.wells[way.start].height, None if way.end is None else landscape.wells[way.end]
