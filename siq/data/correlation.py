@@ -415,8 +415,7 @@ def noise_floors(recordings: Recordings) -> tuple[NoiseFloor, ...] | None:
 def _noise_floor(window: np.ndarray, times: np.ndarray, step: float) -> NoiseFloor:
     """The noise of one state in windows ``(windows, width)``, at times in steps, one row or one each."""
     width = window.shape[1]
-    scaled = 2 * times / times[:, -1:] - 1
-    polynomials = np.linalg.qr(np.polynomial.legendre.legvander(scaled, width - 1))[0]
+    polynomials = np.linalg.qr(np.polynomial.legendre.legvander(2 * times / times[:, -1:] - 1, width - 1))[0]
     walk = np.minimum(times[:, :, None], times[:, None])
     typical = float(np.mean(np.diff(window, axis=1) ** 2))
     for lowest in (width // SMOOTH_SHARE, width // 2):

@@ -599,8 +599,7 @@ def _crossed_as_often(values: np.ndarray, levels: np.ndarray, runs: list[slice],
     for series in _surrogates(parts, FEWEST_SURROGATES, generator=draw):
         above = series > places
         counts.append(np.concatenate([(above[:, lag:] != above[:, :-lag]).sum(axis=1) for lag in lags]))
-    fewer = np.mean(counts[1:], axis=0) - counts
-    largest = (fewer / positive(np.std(counts[1:], axis=0))).max(axis=1)
+    largest = ((np.mean(counts[1:], axis=0) - counts) / positive(np.std(counts[1:], axis=0))).max(axis=1)
     return float(np.mean(largest[1:] >= largest[0]))
 
 

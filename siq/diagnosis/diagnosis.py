@@ -296,25 +296,28 @@ def solve_case(
     budget = Budget(work=allowed.evaluations, seconds=allowed.seconds, tell=tell, clock=clock)
     try:
         # What a computer writes is held until the next sample: on a line between samples that is late.
-        same, on_lines = case.settings.search.same, None
-        if (held := case.with_held_inputs()) is not None:
+        same, other, on_lines = case.settings.search.same, case.with_held_inputs(), True
+        if other is not None:
             with contextlib.suppress(*NUMERICAL_ERRORS, BudgetSpent):
-                both = ((with_expectations(each.system), each.learn) for each in (case, held))
+                both = ((with_expectations(each.system), each.learn) for each in (case, other))
                 lines, steps = (recalibrate(*each, budget=budget)[0] for each in both)
-                if steps.log_likelihood > lines.log_likelihood + same / 2:
-                    case, on_lines = held, case
+                on_lines = steps.log_likelihood <= lines.log_likelihood + same / 2
+                case, other = (case, other) if on_lines else (other, case)
         found, shown, statement = _judged(case, budget)
-        if on_lines is not None and statement.verdict.mismatch:
-            # What is missing may be what made them look held.
+        if other is not None and statement.verdict.mismatch:
+            # What is missing may be what made them look held, or hide that they are: what is held comes late
+            # on a line between samples, by less than a sample.
             with contextlib.suppress(*NUMERICAL_ERRORS, BudgetSpent):
-                final = found.final
-                moved = fit_with_process_noise_as_needed(final.model, on_lines.learn, final, budget=budget)
-                if moved.log_likelihood > final.log_likelihood:
-                    again = other, _, stated = _judged(on_lines, budget)
+                final, step = found.final, float(np.median(case.learn.step))
+                late = on_lines and any(lag < step for _, lag in final.model.lags(final.model.values))
+                moved = fit_with_process_noise_as_needed(final.model, other.learn, final, budget=budget)
+                if late or moved.log_likelihood > final.log_likelihood + on_lines * same / 2:
+                    again = fits, _, stated = _judged(other, budget)
                     # A name fewer is worth what candidates that are not told apart may differ by.
-                    fewer = 0 < len(statement.mechanisms) < len(stated.mechanisms)
-                    if 2 * (other.final.log_likelihood - final.log_likelihood) >= same * fewer:
-                        case, (found, shown, statement) = on_lines, again
+                    counts = len(stated.mechanisms), len(statement.mechanisms)
+                    least = same * float(np.sign(counts[0] - counts[1])) if all(counts) else 0.0
+                    if 2 * (fits.final.log_likelihood - final.log_likelihood) >= least:
+                        case, (found, shown, statement) = other, again
         if statement.verdict.mismatch and not (statement.mechanisms or case.settings.varies):
             # Recordings may differ in a parameter. Where a function describes what is missing, that has to be
             # as likely; elsewhere a name may come to light behind it.

@@ -249,8 +249,7 @@ def phase_portrait(dynamics: Dynamics, points: np.ndarray | None = None, *, seed
         if searched:
             # Up to a level of ½ (x - A)·M (x - A); without a saddle, half of the basin.
             tops = np.array([each.position for each in around[index]])
-            places = tops if len(tops) else descents.paths[descents.ends == index][:, 0]
-            offset = places - one.position
+            offset = (tops if len(tops) else descents.paths[descents.ends == index][:, 0]) - one.position
             heights = 0.5 * np.einsum("ni,ij,nj->n", offset, hessian_at(dynamics, one.position), offset)
             level = LEVEL_BEYOND_SADDLE * float(heights.min()) if len(tops) else float(np.median(heights))
             near = (STARTS_NEAR_ATTRACTOR if d > 1 else 0, level)

@@ -144,6 +144,34 @@ def test_what_a_computer_writes_is_no_clock_offset() -> None:
     assert "interpolation: zero_order" in found.to_card()
 
 
+def test_what_is_missing_may_hide_that_inputs_are_held() -> None:
+    """On lines between samples the sun of a room comes with a lag and a season that make up for the steps."""
+    card = {
+        "name": "room", "time_unit": "h", "states": {"T": {"unit": "degC"}},
+        "inputs": {"o": {"unit": "degC"}, "s": {"unit": "kW/m^2"}}, "outputs": {"T": "T"},
+        "parameters": {"a": {"value": 0.2, "unit": "1/h"}}, "equations": {"T": "a*(o - T)"},
+    }  # fmt: skip
+    t, generator, tables = 0.5 * np.arange(160), np.random.default_rng(3), []
+    kept = np.exp(-0.15 * 0.5)  # from sample to sample
+    for n in range(3):
+        o = 8 + 4 * np.sin(0.26 * t + n) + 2 * np.sin(0.9 * t + 2 * n)
+        s = np.clip(np.sin(0.26 * t + 0.5 * n), 0, None) * generator.uniform(0.4, 1)
+        s, temperature = s + 0.2 * np.sin(1.3 * t) ** 2, np.full(160, 12.0)
+        for k in range(159):
+            temperature[k + 1] = temperature[k] * kept + (o[k] + 2.0 / 0.15 * s[k]) * (1 - kept)
+        temperature += 0.02 * generator.normal(size=160)
+        tables.append(pd.DataFrame({"recording": f"r{n}", "t": t, "T": temperature, "o": o, "s": s}))
+    some = {"input gain", "input delay", "constant bias", "periodic forcing", "sensor lag"}
+    without = [each.name for each in standard_dictionary() if each.name not in some]
+    settings = siq.MismatchStudy(without=without, held_out=("r2",))
+    found = siq.diagnose(card, pd.concat(tables), settings=settings)
+    (gain,) = found.mechanisms
+    assert gain.label == "input gain in T (T, s)"
+    (size,) = gain.parameters.values()
+    assert abs(size.estimate - 2.0) < 3 * size.standard_error < 0.02
+    assert "diagnosis.held_inputs" in {one.code for one in found.statement.remarks}
+
+
 def test_spikes_of_a_sensor_are_left_out_and_told() -> None:
     t, generator = 0.1 * np.arange(150), np.random.default_rng(2)
     spikes = generator.random((4, 150)) < 0.02
