@@ -561,12 +561,12 @@ def _gain_over(one: Sequence[Horizon], other: Sequence[Horizon]) -> float:
 
 def _next_rung(
     horizons: Sequence[Horizon], candidates: Sequence[MechanismCandidate], context: FitContext,
-    untried: dict[str, NotFitted], on_trial: list[_Rung] | None = None, asked: str = "",
+    untried: dict[str, NotFitted], on_trial: list[_Leader] | None = None, asked: str = "",
 ) -> _Rung | None:  # fmt: skip
     """The mechanism that stands first on top of fits; None where none is likelier than what has no name.
 
     Then the one that comes first all the same is put on trial, where a list for that is given. One that is
-    asked for, by its label, is fitted whatever it promises.
+    asked for by its label is fitted whatever it promises.
     """
     options, base, budget = context.study.search, horizons[0].fit, context.budget
     budget.says("comparing forecasts of what was left out")
@@ -730,11 +730,7 @@ def _next_rung(
     general = np.array([site.candidate is None for site in sites]) & family & likelier
     if log_odds < options.least_log_odds or general.any():
         if on_trial is not None:
-            each = max(leading, key=lambda each: each.weight)
-            fit, data, blocks = each.horizons[0].fit, horizons[0].data, options.blocks
-            whole = FittedCandidate.of(fit, base, data, each.candidate, blocks=blocks)
-            nothing = AcceptedMechanism(whole, {"same": (), "less": ()})
-            on_trial.append(_Rung(nothing, tuple(each.horizons), log_odds, flat_log_odds))
+            on_trial.append(max(leading, key=lambda each: each.weight))
         return None
     members = {sites[k].label: weights[k] for k in np.flatnonzero(family) if sites[k].candidate is not None}
     alike = {label for label, weight in members.items() if weight > leader.weight + np.log(PLAUSIBLE)}
@@ -866,11 +862,13 @@ def _below(rung: _Rung, context: FitContext) -> _Rung | None:
 def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[_Rung], list[NotFitted], list[_Rung]]:
     """Mechanisms one on top of the other, as long as the next is likelier than what has no name.
 
+    Where nothing is certain at first, two may be that are certain only beside each other.
+
     A mechanism may take over a part of an error of the model, above all on top of others, and most causes
     that have no name look a little like one that has. So the last one has to take more than it leaves of what
     free runs of parts left out are off by, beyond the sensors' noise, or it is taken back, and then the one
-    before it is the last. One that those after it make needless stood for them: the climb is made again
-    without it, and counts unless it has more names or foresees worse.
+    before it is the last; of two that need each other both are. One that those after it make needless stood
+    for them: the climb is made again without it, and counts unless it has more names or foresees worse.
 
     Returned are also the fits of the simulation alone, empty where it cannot be fitted, what could not be
     judged, and what was taken back.
@@ -878,43 +876,43 @@ def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[_Rung], li
     model, found, untried = context.model, list[_Rung](), dict[str, NotFitted]()
     alone, budget, together = list[Horizon](), context.budget, False
 
-    def next_on(below: Sequence[_Rung], on_trial: list[_Rung] | None = None, asked: str = "") -> _Rung | None:
-        horizons = below[-1].horizons if below else alone
+    def next_on(
+        below: Sequence[MechanismCandidate], horizons: Sequence[Horizon],
+        on_trial: list[_Leader] | None = None, asked: str = "",
+    ) -> _Rung | None:  # fmt: skip
         base = horizons[0].fit.model
         remaining = [
             each.rebased(model, base) if below else each
             for each in context.candidates
-            if not any(each.repeats(other.accepted.best.candidate) for other in below)
+            if not any(each.repeats(other) for other in below)
             and min(base.dimension, each.model.dimension) == model.dimension
         ]
         return _next_rung(horizons, remaining, context, untried, on_trial, asked)
 
-    def together_with(first: _Rung) -> list[_Rung]:
+    def together_with(first: _Leader) -> list[_Rung]:
         """The two that are certain beside each other, where neither is alone."""
-        second = next_on([first])
+        own, second = first.candidate, next_on([first.candidate], first.horizons)
         below = None if second is None else _below(second, context)
-        own = first.accepted.best.candidate
-        again = None if below is None else next_on([below], asked=own.label)
-        if second is None or below is None or again is None:
+        if second is None or below is None:
             return []
-        found = again.accepted.best.candidate
-        if found.label == own.label:
+        again = next_on([below.accepted.best.candidate], below.horizons, asked=own.label)
+        if again is None or _kind_of(again.accepted.best.candidate, model) != _kind_of(own, model):
+            return []
+        if again.accepted.best.candidate.label == own.label:
             return [again.placed(own, first.horizons), second]
-        return [below, again] if _kind_of(found, model) == _kind_of(own, model) else []
+        return [below, again]
 
     try:
         with budget.part(FIRST_NAME_SHARE):
             alone = _horizons_of(fit, context)
         while len(found) < context.study.search.mechanisms:
-            on_trial = list[_Rung]()
+            on_trial, names = list[_Leader](), [each.accepted.best.candidate for each in found]
             with budget.part(1.0 if found else FIRST_NAME_SHARE):
-                rung = next_on(found, on_trial)
-                rungs = [rung] if rung is not None else []
-                if on_trial and not found:
-                    rungs = together_with(on_trial[0])
-                    together = bool(rungs)
+                rung = next_on(names, found[-1].horizons if found else alone, None if found else on_trial)
+                rungs = [rung] if rung is not None else together_with(*on_trial) if on_trial else []
             if not rungs:
                 break
+            together |= len(rungs) > 1
             for each in rungs:
                 LOGGER.info("found %s by forecasts", each.accepted.best.candidate.label)
             found += rungs
