@@ -136,8 +136,7 @@ class Recordings:
         from siq.data.tables import read_tables  # which imports pyarrow
 
         levels = [name for name in frame.index.names if name in ("recording", "t")]
-        table = frame.reset_index(level=levels) if levels else frame
-        read = read_tables(table, columns=columns, units=units)
+        read = read_tables(frame.reset_index(level=levels) if levels else frame, columns=columns, units=units)
         given = units or {}
         return replace(
             read,

@@ -352,8 +352,7 @@ class RecordStates:
         import pandas as pd
 
         whole = sum(one.time for one in self.counts) or np.nan
-        unknown = np.full((len(self.counts), 3), np.nan)
-        markov = unknown if self.markov is None else self.markov.stays
+        markov = np.full((len(self.counts), 3), np.nan) if self.markov is None else self.markov.stays
         exponential = self.exponential or (None,) * len(self.counts)
         rows = [
             (level, one.time / whole, one.visits, one.mean, *one.limits, law, *model)

@@ -98,7 +98,7 @@ def relaxation_samples(values: np.ndarray, runs: list[slice], *, noisy: bool = F
     growth = np.array(times[1:]) / times[:-1]
     turns = np.append(False, (growth[1:-1] < growth[:-2]) & (growth[1:-1] < growth[2:]))
     settled = np.flatnonzero((growth[: len(turns)] <= SETTLED_GROWTH) | turns)
-    return max(times[(int(settled[0]) if len(settled) else int(np.argmin(growth))) + 1], 1.0)
+    return max(times[int(settled[0] if len(settled) else np.argmin(growth)) + 1], 1.0)
 
 
 def _correlated(values: np.ndarray, begins: np.ndarray, length: int) -> float | None:

@@ -106,10 +106,12 @@ class HeldOutErrors:
         known: float | None = getattr(self, self.better_without if run == "without" else run)
         return known
 
+    def _blocks(self, run: Run) -> tuple[float, ...] | None:
+        return self.squares.get(self.better_without if run == "without" else run)
+
     def change(self, first: Run, second: Run) -> Change:
         """Whether the second of two simulations is better, by more than appears by chance."""
-        names = (self.better_without if each == "without" else each for each in (first, second))
-        return _change_between(*map(self.squares.get, names))
+        return _change_between(self._blocks(first), self._blocks(second))
 
     @property
     def share_gained(self) -> float:
@@ -128,17 +130,21 @@ class HeldOutErrors:
 
         One that lands in another well, or on another tooth, is off from there on, however right it is.
         """
-        blocks = self.squares.get(self.better_without if run == "without" else run)
+        blocks = self._blocks(run)
         return float(np.exp(0.5 * np.log(positive(np.array(blocks))).mean())) if blocks else None
+
+    def falls_typically(self, first: Run, second: Run) -> bool:
+        """Whether the second of two simulations is better in most blocks, if not in the mean of all."""
+        one, other = self._blocks(first), self._blocks(second)
+        return bool(one and other) and typically_better(one or (), other or ())
 
     @property
     def no_better(self) -> bool:
         """Whether what was found foresees no better than what lacks it, neither in the mean nor typically."""
-        without, blocks = self.error("without"), self.squares
+        without = self.error("without")
         if without is None or self.augmented is None:
             return without is not None
-        typical = typically_better(blocks[self.better_without], blocks["augmented"]) if blocks else False
-        return self.augmented >= without and not typical
+        return self.augmented >= without and not self.falls_typically("without", "augmented")
 
     @property
     def takes_most(self) -> bool:

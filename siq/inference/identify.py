@@ -396,7 +396,7 @@ class _Case:
         noise, pairs = found.diagnosis, len(self._pairs(self.recordings).h)
         assert noise is not None and noise.measurement_error is not None
         forced = bool(found.noise_rate.any())
-        if found.hidden_states and not forced and (len({unit for unit in self.units if unit}) > 1):
+        if found.hidden_states and not forced and len({unit for unit in self.units if unit}) > 1:
             raise NumericalFailure(
                 "no process noise is seen that would show D, and the positions have different units, so that"
                 " no unit matrix can stand for it; scale them to one unit"

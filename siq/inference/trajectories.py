@@ -388,7 +388,7 @@ def free_run(
     if not np.isfinite(states).all():  # a tank may empty that never did before
         substeps = max(substeps, EDGE_SUBSTEPS)
         spread = spread_edges(model, data, states, substeps=substeps)
-        if spread.edges != model.edges:
+        if dict(spread.edges).keys() - dict(model.edges).keys():
             states = run(spread, Grid(data, substeps), x)
     signals = data.signals(data.t, data.recording, delays=model.lags(model.values))
     return np.asarray(model.functions.outputs(states.T, signals, model.values).T)
@@ -460,8 +460,9 @@ def spread_edges(model: Dynamics, data: Measurements, x: np.ndarray, *, substeps
     edges = []
     for argument, course in zip(arguments, along, strict=True):
         course = np.broadcast_to(course, data.t.shape)
-        passed = float(np.sqrt(np.nanmean((course[rows + 1] - course[rows]) ** 2)))
-        if argument in jumps or abs(np.nanmin(course)) <= passed:
+        known = np.isfinite(moved := course[rows + 1] - course[rows])
+        passed = float(np.sqrt(np.mean(moved[known] ** 2))) if known.any() else 0.0
+        if argument in jumps or abs(np.nanmin(course, initial=np.inf)) <= passed:
             edges.append((argument, EDGE * passed / substeps + 1e-300))
     return replace(model, edges=tuple(edges))
 

@@ -213,5 +213,5 @@ def place_text(position: Sequence[float] | np.ndarray, *, digits: int = 3) -> st
     """
     size = max((abs(float(value)) for value in position), default=0.0)
     unit = 10.0 ** (_exponent(size, digits) - digits + 1) if size else 1.0
-    texts = [f"{value:.{digits}g}" for value in [round(float(value) / unit) * unit for value in position]]
+    texts = [f"{round(float(value) / unit) * unit:.{digits}g}" for value in position]
     return "(" + ", ".join("0" if float(text) == 0 else text.replace("-", MINUS) for text in texts) + ")"

@@ -101,8 +101,7 @@ def find_landscape(
                 remarks.append(Remark("quasipotential.no_refined_formula", {"place": place}))
     # What no certificate vouches for says nothing of barriers: paths of least action alone do.
     test = None if certificate is None else certificate.tests.get("error")
-    told = kept if test is None or test.passed else [None] * len(kept)
-    ways = transitions(found, paths, told)
+    ways = transitions(found, paths, kept if test is None or test.passed else [None] * len(kept))
     return _assembled(found, portrait, kept, ways, remarks, certificate=certificate, noise=noise)
 
 

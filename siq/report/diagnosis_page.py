@@ -377,7 +377,7 @@ def _rows_of(part: StatedTerm, findings: Findings) -> list[FormulaRow]:
 def _meaning(name: str, entry: Mechanism | None, findings: Findings) -> str:
     """What a formula of a mechanism is; see `siq.diagnosis.mechanisms.MechanismCandidate.changes`."""
     words, forms = texts("tables")["formula_of"], () if entry is None else entry.forms
-    if (name in [output for output, _ in findings.before.outputs]) and any(form.outputs for form in forms):
+    if name in [output for output, _ in findings.before.outputs] and any(form.outputs for form in forms):
         return str(words["measured"]).format(name)
     if name not in findings.before.states:
         return str(words["new"]).format(name)

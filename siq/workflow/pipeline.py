@@ -330,8 +330,7 @@ def landscape_of_run(
     except (NumericalFailure, np.linalg.LinAlgError) as error:
         return StepResult(None, Outcome(number, Step.LANDSCAPE, Status.FAILED, str(error)))
     whole = found.global_quasipotential is not None and not found.notes
-    status = Status.OK if whole else Status.WARNING
-    outcome = Outcome(number, Step.LANDSCAPE, status, "; ".join(found.notes))
+    outcome = Outcome(number, Step.LANDSCAPE, Status.OK if whole else Status.WARNING, "; ".join(found.notes))
     note = record.diffusion_source.note
     if note is not None:
         found = replace(found, remarks=(*found.remarks, Remark("quasipotential.reason", {"reason": note})))

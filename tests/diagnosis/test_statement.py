@@ -198,6 +198,11 @@ def test_what_lands_elsewhere_from_some_time_on_is_told_by_its_typical_error():
     assert "In the mean it is 10.3 %" in text and "11.0 %" in text and "does not improve" not in text
 
 
+def test_a_typical_gain_is_that_of_the_two_which_are_compared():
+    errors = errors_with({"before": 0.2, "recalibrated": 0.2, "augmented": 0.103, "named": 0.103}, 0.001)
+    assert errors.falls_typically("without", "augmented") and not errors.falls_typically("named", "augmented")
+
+
 def test_a_parameter_shift_names_its_parameters_with_both_values():
     for number in CASES:
         statement = statement_from(number, MismatchVerdict.PARAMETER_SHIFT)
