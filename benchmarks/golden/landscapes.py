@@ -166,7 +166,7 @@ def analysed(record: pd.DataFrame) -> dict[str, Any]:
     if found.noise is not None:
         said |= {"epsilon": found.noise.intensity, "epsilon_error": found.noise.standard_error}
         said |= {"dwell_time recorded": found.dwell_times()["mean_time"]}
-    return said | {"position_errors": found.position_errors} | states_of(found.seen)
+    return said | {"position_errors": found.position_errors} | states_of(found.recorded_states)
 
 
 def support_of(dynamics: siq.Dynamics) -> dict[str, Any]:

@@ -5,6 +5,8 @@ Statistics of lags need samples one after the other, a step apart; they come fro
 that its mean square displacement grows as ``M(k) = σ²h k`` over k steps. It grows otherwise where
 
 - the sensor errs: ``M(k) = σ²h k + 2R``;
+- the clock errs, by u steps: ``M(k) = σ²h E|k + √2 u ξ|`` with a normal ξ, which tends to ``σ²h k``. Steps
+  of all lengths make tails, by which a clock is told from the sums of what follows;
 - a sample is the mean over an exposure of u steps: ``M(k) = σ²h (k - u/3)`` for ``k ≥ u``, and
   ``σ²h (k²/u - k³/3u²)`` before;
 - the forces are an Ornstein–Uhlenbeck process of the memory u, or the sensor is a low-pass filter of that
@@ -53,7 +55,9 @@ from siq.data.stationarity import (
 )
 from siq.numerics.randomness import positive
 
-Kind = Literal["none", "white", "sensor", "blur", "coloured", "either", "memory", "hidden", "unknown"]
+Kind = Literal[
+    "none", "white", "sensor", "clock", "blur", "coloured", "either", "memory", "hidden", "unknown"
+]  # fmt: skip
 
 FALSE_ALARM_RATE = 1e-3  # one record in a thousand of white noise is taken for one with a memory
 NEGLIGIBLE_CORRELATION = 0.005  # twice that, one per cent, is what it adds to the strength of the noise
@@ -71,6 +75,7 @@ MOST_SAMPLES = 400_000  # looked at: a correlation is then known to 0.002
 LAG_GROWTH = 1.2  # of the lags that are tried, about as exactly as they are known
 NOISE_FREE_RESIDUAL = 1e-3  # of the rms step: less is left where nothing but the integrator erred
 MIN_CHI2_GAIN = 6.0  # the other is e³ = 20 times less likely, or a further number worth its while
+TAILS_KNOWN = 0.1  # as D(x) makes others: a choice
 MEMORIES_TRIED = 40  # before the best is refined
 EIGENVALUE_FLOOR = 1e-9  # of the largest, so that a covariance can be inverted
 
@@ -80,16 +85,16 @@ class MarkovLag:
     """How long a record remembers, and why.
 
     Its kind is ``none``: no noise. ``white``: white process noise. ``sensor``: measurement noise, new in each
-    sample. ``blur``: each sample is a mean over an exposure. ``coloured``: the process noise has a memory, or
-    the sensor is slow. ``either`` of these two. ``memory``: it remembers in another way, such as by an
-    oscillation of its own. ``hidden``: it remembers longer than it takes to relax, as where a state is not
-    recorded. ``unknown``: too few samples, or uneven ones.
+    sample. ``clock``: each was taken at another time than it is said. ``blur``: each is a mean over an
+    exposure. ``coloured``: the process noise has a memory, or the sensor is slow. ``either`` of these two.
+    ``memory``: it remembers in another way, as by an oscillation of its own. ``hidden``: it remembers longer
+    than it takes to relax, as where a state is not recorded. ``unknown``: too few samples, or uneven ones.
     """
 
     kind: Kind
     lag: int | None  #: from so many steps on it is Markovian: 0 of white noise, None where none was found
     step: float  #: the usual time between samples
-    memory: float  #: exposure, or memory of the forces, in the unit of time; 0 where there is none
+    memory: float  #: exposure, memory of the forces, or error of the clock, in the unit of time; else 0
     relaxation: float  #: the shortest time in which the state relaxes; NaN where nothing is known of it
     lags: np.ndarray  #: (K,), in steps
     correlations: np.ndarray  #: (K, d): of residuals so many steps apart, for each state
@@ -132,13 +137,12 @@ class _Residuals(NamedTuple):
         return values, np.sqrt(spread * self.kurtosis(most) / self.size)
 
     def kurtosis(self, lag: int) -> np.ndarray:
-        """Mean of r²(t) r²(t+lag) over that of r² squared: 1 where the strength is the same everywhere."""
+        """Mean of r²(t) r²(t+lag) over that of r² squared: 1 where the strength is the same; 3 at lag 0."""
         squares, both = self.rest**2, same_stretch(self.number, lag)
         mean = squares[self.number >= 0].mean(axis=0) ** 2
         if both.sum() < STEPS_PER_FUNCTION:
             return np.ones(squares.shape[1])
-        product = (squares[: len(both)] * squares[lag:])[both].mean(axis=0)
-        return np.maximum(product / positive(mean), 1.0)
+        return np.maximum((squares[: len(both)] * squares[lag:])[both].mean(axis=0) / positive(mean), 1.0)
 
 
 class _Increments(NamedTuple):
@@ -232,8 +236,8 @@ def markov_lag(recordings: Recordings, *, angles: Mapping[str, Sequence[float]] 
     most = max(2 * lag, FIRST_LAGS)
     own = np.einsum("kii->ki", lagged_covariances(seen.rest, seen.number, most))
     marked = np.flatnonzero(_significant(*seen.correlations(FIRST_LAGS)))
-    kurtosis = seen.kurtosis(lag + 1)
-    fits = [_fitted_shape(own[:, place], seen.size / kurtosis[place], seen=lag) for place in marked]
+    counts, tails = seen.size / seen.kurtosis(lag + 1), seen.kurtosis(0) / 3
+    fits = [_fitted_shape(own[:, at], counts[at], seen=lag, tails=tails[at]) for at in marked]
     longest = max(fits, key=lambda fit: fit.memory, default=None)
     if longest is None or longest.shape == "white":
         return told("white", 0, seen, most)
@@ -301,7 +305,7 @@ class _Shape(NamedTuple):
     """The kind of noise that fits covariances of residuals over lags."""
 
     shape: Kind  # ``either`` where an exposure fits about as well as forces with a memory
-    memory: float  # exposure, or memory, in steps; 0 of white noise and of sensor noise
+    memory: float  # exposure, memory, or error of the clock, in steps; 0 of white noise and of sensor noise
     sensor: float  # variance of the sensor's error
     misfit: float  # χ² of what is left, and ...
     freedom: int  # ... the number that it has in the mean where the kind is right
@@ -314,10 +318,13 @@ class _Shape(NamedTuple):
 
 
 def _displacement(kind: Kind, lags: np.ndarray, u: float) -> np.ndarray:
-    """M(k)/σ²h of means over an exposure of u steps, or else of forces with a memory of u steps."""
+    """M(k)/σ²h of means over an exposure, by a clock with errors, or of forces with a memory, of u steps."""
     k = np.abs(np.asarray(lags, dtype=float))
     if u <= 0:
         return k
+    if kind == "clock":  # the mean of a folded normal distribution
+        folded = 2 * u / np.sqrt(np.pi) * np.exp(-((k / (2 * u)) ** 2)) + k * scipy.special.erf(k / (2 * u))
+        return np.where(k > 0, folded, 0.0)
     if kind == "blur":
         return np.where(k >= u, k - u / 3, k**2 / u - k**3 / (3 * u**2))
     return k + u * np.expm1(-k / u)
@@ -329,11 +336,12 @@ def _increment_covariances(displacement: np.ndarray) -> np.ndarray:
     return np.asarray((displacement[1:] - 2 * displacement[:-1] + before) / 2)
 
 
-def _fitted_shape(covariances: np.ndarray, count: float, *, seen: int) -> _Shape:
+def _fitted_shape(covariances: np.ndarray, count: float, *, seen: int, tails: float) -> _Shape:
     """The simplest kind of noise that explains covariances of `count` residuals 0 ... K steps apart.
 
     From the lag `seen` on none is told from zero. By Bartlett's formula the covariances have themselves the
-    covariance ``Σ_m (C_m C_(m+j-k) + C_(m+j) C_(m-k)) / n``.
+    covariance ``Σ_m (C_m C_(m+j-k) + C_(m+j) C_(m-k)) / n``. Of `tails`, the fourth moment of residuals over
+    that of normal ones, a clock makes ``(1 + 2u²)/E²|1 + √2 u ξ|``.
     """
     size, lags = len(covariances), np.arange(len(covariances) + 1)
     known = np.where(np.arange(size) <= seen, covariances, 0.0)
@@ -374,7 +382,13 @@ def _fitted_shape(covariances: np.ndarray, count: float, *, seen: int) -> _Shape
         min((best(kind, False), best(kind, True)), key=lambda fit: fit.cost) for kind in ("blur", "coloured")
     ]
     first, second = sorted(with_memory, key=lambda fit: fit.cost)
-    chosen = min(fitted("white", 0.0, False), fitted("sensor", 0.0, True), first, key=lambda fit: fit.cost)
+    plain = fitted("white", 0.0, False), fitted("sensor", 0.0, True)  # whose tails may be anything
+    chosen = min(*plain, first, key=lambda fit: fit.cost)
+    clock = best("clock", False)
+    made = (1 + 2 * clock.memory**2) / _displacement("clock", lags[1:2], clock.memory)[0] ** 2
+    told_by_tails = ((tails - 1) ** 2 - (tails - made) ** 2) / TAILS_KNOWN**2
+    if clock.cost < min(chosen.cost + told_by_tails, *(one.cost - MIN_CHI2_GAIN for one in plain)):
+        return clock
     either = second.misfit - first.misfit < MIN_CHI2_GAIN and chosen is first
     return chosen._replace(shape="either") if either else chosen
 

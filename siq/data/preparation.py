@@ -6,6 +6,7 @@ drifts slowly in it. Columns that never change are no states. Each step leaves a
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -51,6 +52,7 @@ FALSE_FAULT_RATE = 1e-3  # probability with which a record of white noise has a 
 FEW_JUMPS, MOST_APART = 0.05, 0.01  # that stay, a sample that does not; of all samples
 MOST_ALIKE = 0.1  # of all samples, where most that stand apart are one number; of held values, one number
 QUARTERS, SAME_WAVE = 4, 0.5  # of a recording, in which a hum has one amplitude and phase, to a half of it
+STEP_KNOWN = 4 * np.sqrt(2)  # errors of the clock, of two samples: steps as long are known to a quarter
 BY_CHANCE = 2.5  # standard errors of such an amplitude and phase: four in five records are within
 SLIGHT_HUM = 0.1  # of the variance of a state: what moves it more may be the state itself, which circulates
 SEASONS = {"day": 86_400.0, "year": 31_556_952.0}  # seconds: what the sun does to what stands outdoors
@@ -238,7 +240,8 @@ def without_faults(recordings: Recordings) -> Recordings:
     spectrum of the steps that keeps its amplitude and its phase in every quarter of a recording, and that
     hardly moves the state; at 50 or 60 Hz, and up to four times that, it may be as slight as it likes. Of
     each state four such lines are taken off at most. What has the period of a day or of a year, and is alike
-    in each, is the weather's.
+    in each, is the weather's. Where the clock errs, one of so many samples is kept that steps are known to a
+    quarter.
     """
     if noise_floors(recordings) is None:
         return recordings
@@ -281,6 +284,12 @@ def without_faults(recordings: Recordings) -> Recordings:
             values = {"column": recordings.titles[state], "samples": count}
             remarks.append(Remark("data.samples_apart", values))
     found = _without_rows(recordings, apart)
+    if (seen := markov_lag(found)).kind == "clock":
+        every = math.ceil(STEP_KNOWN * seen.memory / seen.step)
+        begins = np.searchsorted(found.recording, found.recording)
+        found = _without_rows(found, (np.arange(len(found.t)) - begins) % every != 0)
+        values = {"every": every, "error": seen.memory, "unit": found.time_unit}
+        remarks.append(Remark("data.clock", values))
     for state, name in product(range(len(found.names)), SEASONS):
         season = _season_of(found, found.values[:, state], name)
         if season.any():

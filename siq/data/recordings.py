@@ -179,8 +179,7 @@ class Recordings:
 
         one = isinstance(values, np.ndarray) and values.ndim == 2
         parts = [np.asarray(each, dtype=float) for each in ([values] if one else values)]
-        common = np.ndim(t[0]) == 0
-        times = [np.asarray(each, dtype=float) for each in ([t] * len(parts) if common else t)]
+        times = [np.asarray(each, dtype=float) for each in ([t] * len(parts) if np.ndim(t[0]) == 0 else t)]
         if len(times) != len(parts):
             raise ValueError(f"there are times of {len(times)} recordings and values of {len(parts)}")
         if units is not None and len(units) != len(names):

@@ -287,17 +287,12 @@ def bias_of_rounding(
     The noise is in standard deviations ``(d,)``, and the correlation that of neighbouring residuals: of
     rounding alone it is -1/2 at most.
     """
-    rounding, (low, high) = _rounding_errors(recordings), ROUNDING_RANGE
+    rounding = np.array([rounding_error(resolution_step(values) or 0.0) for values in recordings.values.T])
+    low, high = ROUNDING_RANGE
     own = rounding > 0
     known = (measured <= high * rounding) & ((measured >= low * rounding) | (rounding < rounding.max()))
     small = known[own].all() and (measured[~own] <= rounding.max()).all()
     return _rounding_bias(found, pairs, rounding) if own.any() and small and correlation < -0.3 else None
-
-
-def _rounding_errors(recordings: Recordings) -> np.ndarray:
-    """Standard deviation of what rounding did to each state, 0 where none is recognised: shape ``(d,)``."""
-    steps = [resolution_step(values) for values in recordings.values.T]
-    return np.array([0.0 if step is None else rounding_error(step) for step in steps])
 
 
 def _rounding_bias(found: FieldEstimate, pairs: SnapshotPairs, rounding: np.ndarray) -> float:

@@ -31,6 +31,9 @@ of the past alone, and then the products ``G z`` are martingale differences, wha
     Of a slow force that was not recorded: the fourth cumulant of what a filter knows of it. Where a gate with
     two values would not show in that, it is not tested.
 
+``regular_clock``
+    Of samples that were taken at other times than it is said: as with these, no claim on times is tested.
+
 Of the neighbouring residual `siq.inference.checks` judges, which knows sensors and rounding: what it explains
 is left out here, and the past begins two steps back.
 """
@@ -232,11 +235,13 @@ def check_claims(
     if not rest.noisy.any():  # what settles, seen by a sensor, has no noise that claims are about
         return {}
     forced = found.slow_force and found.noise_rate[1, 1]  # what follows the state alone has no noise
-    slow = {"gaussian_force": _gaussian_force(found, states, false_alarms)} if forced else {}
+    further = {"gaussian_force": _gaussian_force(found, states, false_alarms)} if forced else {}
+    if any(one.code == "data.clock" for one in measured.remarks):
+        further["regular_clock"] = Verdict.not_tested(sentence(Remark("inference.clock")))
     return {
         "one_system": _one_system(rest, whole.labels, false_alarms),
         "unchanged": _unchanged(rest, false_alarms), "state_complete": _state_complete(rest, false_alarms),
-        "gaussian_increments": _gaussian(rest, measured, false_alarms), **slow,
+        "gaussian_increments": _gaussian(rest, measured, false_alarms), **further,
     }  # fmt: skip
 
 

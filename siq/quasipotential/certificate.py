@@ -55,7 +55,7 @@ from siq.systems.equilibria import hessian_at
 from siq.systems.formulas import compile_formulas
 from siq.systems.phase_portrait import PhasePortrait, RecordedRegion
 
-OF_TIMES = ("times",)  # what answers on times rest on, and nothing else does
+OF_TIMES = ("times", "regular_clock")  # what answers on times rest on, and nothing else does
 # What f and D rest on: the record, and no formula of V.
 OF_DYNAMICS = (
     "prediction", "one_system", "unchanged", "state_complete", "gaussian_increments", "existence", "record",
@@ -114,7 +114,7 @@ class Certificate:
             return own
         tests = certificate.tests
         known = all(tests[name].passed for name in OF_DYNAMICS if name in tests)
-        asked = [tests[name] for name in ("times", "gaussian_force") if name in tests]
+        asked = [tests[name] for name in (*OF_TIMES, "gaussian_force") if name in tests]
         if not known or any(one.tested and not one.passed for one in asked):
             return own
         if hidden:

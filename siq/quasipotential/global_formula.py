@@ -72,8 +72,7 @@ class GlobalFormula:
         lowest = int(np.argmin(values))
         difference = functions - functions[lowest]
         variance = np.einsum("nq,qr,nr->n", difference, self.covariance, difference)
-        size = np.linalg.norm(values - values[lowest])
-        return float(np.sqrt(np.maximum(variance, 0).sum()) / size)
+        return float(np.sqrt(np.maximum(variance, 0).sum()) / np.linalg.norm(values - values[lowest]))
 
     def with_circulation(
         self, found: FieldEstimate, points: np.ndarray, *, false_terms: float, precision: float,

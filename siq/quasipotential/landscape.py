@@ -254,11 +254,6 @@ class Landscape:
         return tuple(map(sentence, self.remarks))
 
     @property
-    def seen(self) -> RecordStates | None:
-        """Another name of `recorded_states`."""
-        return self.recorded_states
-
-    @property
     def rung(self) -> int:
         """The rung of the ladder of answers, see `siq.quasipotential.certificate.Certificate.rung`."""
         hidden = self.field_estimate is not None and self.field_estimate.has_hidden_state

@@ -42,7 +42,6 @@ from siq.quasipotential.hamilton_jacobi import (
 from siq.quasipotential.path_chains import MinimumActionPath
 from siq.systems.basins import Basin
 from siq.systems.cycles import Cycle
-from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import Equilibrium, hessian_at, measure_at
 from siq.systems.formulas import DIGITS, Formula
@@ -153,12 +152,8 @@ class Well(Expansion):
     def _terms(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         slope, flow, noise = self.gradients(x), self.dynamics.drift(x), self.dynamics.diffusion
         numerator = np.abs((slope * (flow + noise.push(x, slope))).sum(axis=1))
-        measure = self._measure
+        measure = measure_at(self.dynamics, self.attractor)
         return numerator, np.sqrt(measure.contract(x, slope) * measure.squared_speed(x, flow))
-
-    @cached_property
-    def _measure(self) -> Diffusion:
-        return measure_at(self.dynamics, self.attractor)
 
     @cached_property
     def _size(self) -> float:

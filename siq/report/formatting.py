@@ -236,8 +236,7 @@ def _typeset(
     def text_and_node(entry: sympy.Expr | float) -> tuple[str, Any]:
         if isinstance(entry, sympy.Basic):
             return _formula_text(entry, decimals=decimals), printer.lines(_with_integer_exponents(entry))
-        whole = float(entry).is_integer()
-        text = str(int(entry)).replace("-", MINUS) if whole else value_text(entry)
+        text = str(int(entry)).replace("-", MINUS) if float(entry).is_integer() else value_text(entry)
         return text, printer.leaf("mn", text)
 
     spoken, nodes = zip(*(zip(*map(text_and_node, row), strict=True) for row in rows), strict=True)

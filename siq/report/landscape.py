@@ -321,7 +321,7 @@ def landscape_report(landscape: Landscape, *, markup: bool = False) -> str:
 def _report(landscape: Landscape) -> tuple[list[str], list[tuple[str, pd.DataFrame]]]:
     summary = summarise(landscape)
     certificate = None if landscape.certificate is None else landscape.certificate.as_data()
-    answer, *further = answer_lines(summary, seen=landscape.seen, rung=landscape.rung)
+    answer, *further = answer_lines(summary, seen=landscape.recorded_states, rung=landscape.rung)
     written = certificate is not None or any(well is not None for well in landscape.wells)
     verdict = "U is not written as a formula."
     if written:

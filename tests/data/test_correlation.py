@@ -64,6 +64,25 @@ def test_an_error_of_the_sensor_is_no_memory(sensor: float) -> None:
     assert found.sensor[0] == pytest.approx(sensor, rel=0.1)
 
 
+def jittered(errors: float, seed: int = 1) -> np.ndarray:
+    """A double well whose samples are taken as many steps earlier or later, by normal errors."""
+    fine = double_wells(seed, samples=320_000, traces=1, intensity=0.3)[0, :, 0]
+    late = errors * np.random.default_rng(seed).standard_normal(20_000)
+    return fine[np.clip(np.round(16 * (np.arange(20_000) + late)), 0, len(fine) - 1).astype(int)][
+        None, :, None
+    ]
+
+
+@pytest.mark.parametrize("errors", [0.8, 1.2])
+def test_a_clock_with_errors_is_told_from_a_sensor_with_errors(errors: float) -> None:
+    found = markov_lag(recorded(jittered(errors), 16 * STEP))
+    assert found.kind == "clock" and not found.remembers
+    assert found.memory == pytest.approx(errors * 16 * STEP, rel=0.15)
+    heavy = jittered(0.0)
+    heavy += 0.15 * np.random.default_rng(0).standard_t(4, heavy.shape)
+    assert [markov_lag(recorded(heavy[:, :n], 16 * STEP)).kind for n in (2000, 20_000)] == ["sensor"] * 2
+
+
 def test_white_noise_raises_no_alarm() -> None:
     """One in a thousand is allowed; of forty records none is one with a memory."""
     draw = np.random.default_rng(5)
@@ -150,7 +169,7 @@ def test_long_run_covariance_is_that_of_sums() -> None:
     assert long_run_covariance(covariances, 2)[0, 0] == pytest.approx(1.75**2, rel=0.02)
 
 
-@pytest.mark.parametrize("kind", ["blur", "coloured"])
+@pytest.mark.parametrize("kind", ["blur", "coloured", "clock"])
 def test_displacements_are_those_of_simulated_forces(kind: Kind) -> None:
     """Over long times all of σ² is seen, and without a memory nothing is correlated."""
     own = _increment_covariances(_displacement(kind, np.arange(400), 3.0))

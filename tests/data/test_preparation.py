@@ -80,6 +80,17 @@ def test_samples_that_stand_apart_are_left_out_and_nothing_else() -> None:
     assert without_faults(seen(x)).values.shape == x.shape
 
 
+def test_of_samples_with_a_clock_that_errs_those_are_kept_that_are_in_order() -> None:
+    fine = double_wells(2, samples=320_000, traces=1, intensity=0.3)[0]
+    late = np.random.default_rng(2).standard_normal(20_000)
+    x = fine[np.clip(np.round(16 * (np.arange(20_000) + late)), 0, len(fine) - 1).astype(int)]
+    x = x + 1e-4 * np.random.default_rng(3).standard_normal(x.shape)  # values that repeat were filled in
+    found = without_faults(Recordings.from_arrays(0.16 * np.arange(len(x)), x, names=["x"]))
+    (told,) = (one.values for one in found.remarks if one.code == "data.clock")
+    assert told["error"] == pytest.approx(0.16, rel=0.15) and 5 <= told["every"] <= 7
+    np.testing.assert_array_equal(found.values, x[:: told["every"]])
+
+
 def test_faults_that_follow_each_other_or_are_just_too_small_are_no_jumps() -> None:
     x, rows = hopping(), np.arange(50, 19_950, 500)
     usual = float(np.median(np.abs(np.diff(x[:, 0])))) / 0.6745

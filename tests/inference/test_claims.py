@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from siq.inference.field_estimate import FieldEstimate, Verdict
 from siq.inference.library import IdentificationOptions, field_library
 from siq.inference.regression import refit
 from siq.numerics.integration import FlowMap
+from siq.remarks import Remark
 from siq.systems.diffusion import Diffusion
 
 STEP, WITHIN, INTENSITY, LIMIT = 0.05, 4, 0.25, 0.05 / 8
@@ -41,13 +43,16 @@ def records(
 
 
 def claims(
-    *parts: np.ndarray, kept: np.ndarray | None = None, times: np.ndarray | None = None
+    *parts: np.ndarray,
+    kept: np.ndarray | None = None,
+    times: np.ndarray | None = None,
+    remarks: tuple[Remark, ...] = (),
 ) -> dict[str, Verdict]:
     """Of recordings ``(n, 1)`` each, with x and x³ fitted to them; or of some samples of one."""
     steps = [np.arange(len(one)) if kept is None else np.flatnonzero(kept) for one in parts]
     clocks = [STEP * one if times is None else times for one in steps]
     parts = parts if kept is None else tuple(one[kept] for one in parts)
-    recordings = Recordings.from_arrays(clocks, list(parts), names=["x"])
+    recordings = replace(Recordings.from_arrays(clocks, list(parts), names=["x"]), remarks=remarks)
     support = np.array([[0, LIBRARY.names.index(name)] for name in ("1", "x", "x**3")])
     found = FieldEstimate.on_support(
         LIBRARY, support, np.array([0.0, 1.0, -1.0]), np.eye(3), np.array([[INTENSITY]]), 0.1,
@@ -211,6 +216,13 @@ def test_noise_that_is_not_gaussian_is_noticed() -> None:
         assert not claims(record)["gaussian_increments"].passed
     rounded = claims(np.round(seen, 3))["gaussian_increments"]
     assert rounded.passed
+
+
+def test_of_a_clock_that_errs_times_are_not_tested() -> None:
+    seen = records(1, samples=3000, seed=5)
+    told = claims(*seen, remarks=(Remark("data.clock", {"every": 7, "error": 0.1, "unit": None}),))
+    assert not told["regular_clock"].tested and "earlier or later" in told["regular_clock"].reason
+    assert "regular_clock" not in claims(*seen)
 
 
 def test_large_steps_that_were_taken_out_are_missed() -> None:

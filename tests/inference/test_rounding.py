@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from siq.data.correlation import resolution_step, rounding_error
 from siq.data.recordings import Recordings, snapshot_pairs
-from siq.inference.checks import _rounding_bias, _rounding_errors, bias_of_rounding, residual_noise
+from siq.inference.checks import _rounding_bias, bias_of_rounding, residual_noise
 from siq.inference.field_estimate import HARMLESS_BIAS
 from siq.inference.library import IdentificationOptions, candidate_library
 from siq.inference.regression import identify_vector_field
@@ -97,5 +98,6 @@ def test_rounding_that_is_too_coarse_is_refused_with_the_decimals_that_it_takes(
 
 
 def test_what_was_not_rounded_has_no_rounding_error() -> None:
-    assert _rounding_errors(settling(None)).tolist() == [0.0, 0.0]
-    np.testing.assert_allclose(_rounding_errors(settling(2)), 0.01 / np.sqrt(12))
+    assert [resolution_step(values) for values in settling(None).values.T] == [None, None]
+    steps = [resolution_step(values) for values in settling(2).values.T]
+    assert [rounding_error(step) for step in steps if step] == pytest.approx([0.01 / np.sqrt(12)] * 2)

@@ -135,8 +135,12 @@ def _binned_residuals(dynamics: Dynamics, recordings: Recordings, place: int) ->
     steps = int(np.clip(np.ceil(h.max() * fastest_rate(dynamics, x0, np.ptp(x0, axis=0)) / ACCURACY), 1, 200))
     x = FlowMap(steps)(dynamics.drift_of_components, np.ascontiguousarray(x0.T), h)
     left = (xh[:, place] - x[place]) / h
-    together = 1.0 if lag is None else _together(left, given.number[some], lag)
-    known = np.isfinite(left)
+    known, together = np.isfinite(left), 1.0
+    if lag is not None:  # by how much the error of a mean is larger, since neighbours go together
+        rest = np.where(known, left - left[known].mean(), 0.0)[:, None]
+        covariances = lagged_covariances(rest, given.number[some], lag)
+        whole = long_run_covariance(covariances, lag)
+        together = float(np.sqrt(max(float(whole[0, 0] / covariances[0, 0, 0]), 1.0)))
     left, along = left[known], along[known]
     low, high = float(along.min()), float(along.max())
     which = np.minimum(
@@ -150,13 +154,6 @@ def _binned_residuals(dynamics: Dynamics, recordings: Recordings, place: int) ->
     ]
     share = float(np.sqrt(np.mean(left**2) / np.mean((xh - x0)[:, place] ** 2 / h**2)))
     return pd.DataFrame(binned, columns=["at", "mean", "standard_error"]), share
-
-
-def _together(left: np.ndarray, number: np.ndarray, lag: int) -> float:
-    """By how much the error of a mean is larger, since neighbours go together."""
-    rest = np.where(np.isfinite(left), left - left[np.isfinite(left)].mean(), 0.0)[:, None]
-    covariances = lagged_covariances(rest, number, lag)
-    return float(np.sqrt(max(float(long_run_covariance(covariances, lag)[0, 0] / covariances[0, 0, 0]), 1.0)))
 
 
 def _draw(axes: Axes, binned: pd.DataFrame, share: float, name: str, units: tuple[str, str]) -> list[Any]:

@@ -188,8 +188,7 @@ LINE_STYLES = ("-", "--", "-.", ":")
 
 def look(place: int) -> tuple[str, str, str]:
     """Colour, style of line and marker of the curve at a place, told apart without colour too."""
-    looks = (CURVE_COLOURS, LINE_STYLES, MARKERS)
-    colour, style, marker = (each[place % len(each)] for each in looks)
+    colour, style, marker = (each[place % len(each)] for each in (CURVE_COLOURS, LINE_STYLES, MARKERS))
     return colour, style, marker
 
 
