@@ -358,6 +358,18 @@ HOMES: Mapping[str, Home] = {
         lambda rng: rng.normal(size=1),
         waves,
     ),
+    "wind turbine": Home(
+        {
+            "time_unit": "s",
+            "states": states(w="rad/s"),
+            "inputs": {"u": {"unit": "m/s"}},
+            "parameters": numbers(d=0.3, k=0.2),
+            "equations": {"w": "k*u - d*w"},
+        },
+        0.2,
+        lambda rng: rng.uniform(1.0, 4.0, size=1),
+        lambda rng, t: 4.0 + waves(rng, t),
+    ),
     "pipe": Home(
         {
             "time_unit": "s",
@@ -634,6 +646,18 @@ HOMES: Mapping[str, Home] = {
     "kettle": warmed("g*u - h*s", {"s": "°C", "u": "W"}, (20.0, 300.0), g=20.0),
     "pond": warmed("g*u - h*(s - 15)", {"s": "°C", "u": "kW"}, (20.0, 80.0), time="h", g=2.0),
     "hut": warmed("g - h*s", {"s": "K", "u": "K"}, (20.0, 80.0), time="h", size=20.0, g=3.0),
+    "heated reactor": Home(
+        {
+            "time_unit": "h",
+            "states": states(s="mol/L"),
+            "inputs": {"u": {"unit": "°C"}},
+            "parameters": numbers(k=0.3, g_=0.5),
+            "equations": {"s": "g - k*s"},
+        },
+        0.3,
+        lambda rng: rng.uniform(0.5, 2.5, size=1),
+        lambda rng, t: 25.0 + waves(rng, t, size=4.0),
+    ),
     "lamp": Home(
         {
             "time_unit": "s",
@@ -710,6 +734,7 @@ RESIDENTS: Sequence[Resident] = (
     Resident("eddy-current brake", "mass without damping", {"c": 1.5, "w": 0.5}),
     Resident("amplitude-dependent damping", "rotating frame", {"c": 0.1}),
     Resident("dry friction", "mass", {"c": 0.4}),
+    Resident("dry friction", "mass", {"c": 0.4, "w": 0.05}, "creeps"),
     Resident("dry friction", "rotating frame", {"c": 0.03}),
     Resident("Coulomb and viscous friction", "mass without damping", {"c": 0.2, "d": 0.3}),
     Resident("rolling resistance and drag", "mass", {"c": 0.2, "d": 0.3}),
@@ -817,6 +842,13 @@ RESIDENTS: Sequence[Resident] = (
     Resident("adaptation", "heat", {"c": 0.5, "tau": 3.0}, "in s"),
     Resident("adaptation", "heat", {"b": 0.5, "c": 0.5, "tau": 3.0}, "level in s"),
     Resident("decay or leakage", "hut", {"c": 0.3}, "to u"),
+    Resident("temperature dependence", "heated reactor", {"c": 20.0}),
+    Resident("latent heat", "kettle", {"c": 3.0, "m": 120.0, "w": 30.0}),
+    Resident("limited throughput", "heat", {"c": 0.15, "L": 1.5}, "in r"),
+    Resident("gas spring", "mass", {"c": 1.0, "h": 4.0, "n": 1.3}),
+    Resident("fatigue or depletion", "circuit", {"c": 0.5, "tau": 8.0}),
+    Resident("pressure of a flow", "wind turbine", {"c": 0.1}),
+    Resident("lag phase", "crop", {"c": 1.0, "n": 2.0, "l": 2.0}),
     Resident("cooling by evaporation", "pond", {"c": 0.05, "d": 0.1}),
     Resident("waning immunity", "epidemic", {"c": 0.05, "N": 1.0}),
     Resident("recruitment", "epidemic", {"c": 0.05, "N": 1.0}),

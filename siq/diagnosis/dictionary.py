@@ -439,8 +439,7 @@ def assignments(form: Form, model: Dynamics, roles: Roles) -> Iterator[dict[str,
     them one after the other.
     Nothing fills two roles, and of a symmetric form's ways only one is kept.
     """
-    kinds = list(form.roles.values())
-    names = list(form.roles)
+    kinds, names = list(form.roles.values()), list(form.roles)
     choices: list[list[dict[str, str]]] = []
     # What fills two kinds of roles together, and what fills each by itself.
     pairs: dict[tuple[str, ...], tuple[tuple[str, str], ...]] = {

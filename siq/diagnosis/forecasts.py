@@ -49,7 +49,7 @@ from siq.diagnosis.search import AcceptedMechanism, FitContext, Standing
 from siq.diagnosis.terms import Place, places_in, products_in
 from siq.errors import NumericalFailure
 from siq.inference.budget import Budget, BudgetSpent, evaluation
-from siq.inference.kalman_filter import Noise, Whitened, whiten
+from siq.inference.kalman_filter import Noise, Whitened, substeps_needed, whiten
 from siq.inference.maximum_likelihood import Fit, first_noise, fit_by_multiple_shooting, fit_of_states
 from siq.inference.measurements import Measurements
 from siq.inference.recalibration import fit_with_process_noise_as_needed
@@ -224,6 +224,8 @@ def _fitted(
     no more than it foresees.
     """
     substeps, noise = begin.substeps, begin.noise.of_states(model.dimension)
+    if model.dimension > begin.model.dimension:  # what it brings may be faster than all others
+        substeps = max(substeps, substeps_needed(model, data, model.values, states))
     model = spread_edges(model, data, states, substeps=max(substeps, EDGE_SUBSTEPS))
     substeps = max(substeps, EDGE_SUBSTEPS) if model.edges else substeps
     shown = replace(noise, measurement=data.with_known_noise(np.maximum(noise.measurement, rough)))

@@ -80,8 +80,7 @@ def _structure_of(data: Measurements, fit: Fit, roles: Roles, *, noise: Noise | 
 def _autocorrelation(left: np.ndarray, recording: np.ndarray, known: np.ndarray, outputs: int) -> float:
     """Ljung–Box test over all recordings, output by output."""
     statistic, count = 0.0, 0
-    series = left.reshape(-1, outputs)
-    whole = known.reshape(-1, outputs)
+    series, whole = left.reshape(-1, outputs), known.reshape(-1, outputs)
     owner = recording.reshape(-1, outputs)[:, 0]
     for output in range(outputs):
         y = np.where(whole[:, output], series[:, output], 0.0)

@@ -199,7 +199,7 @@ class Probe:
             return {each.name: each.value for each in free.model.parameters}, free.x
         if not self.candidate.scales:
             return known, x
-        grid = Grid(data, fit.substeps)
+        grid = Grid(data, max(fit.substeps, EDGE_SUBSTEPS))  # it may be faster than the simulation
         further = _at_samples(self._carried(Trajectories(fit.model, grid, x)), grid)
         return known, np.concatenate([x, further], axis=1)
 

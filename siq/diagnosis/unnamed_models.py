@@ -36,7 +36,7 @@ from siq.diagnosis.terms import FUNCTIONS_FITTED, ONE, Place, formula_in, rank_p
 from siq.errors import NumericalFailure
 from siq.inference.budget import Budget, BudgetSpent
 from siq.inference.kalman_filter import substeps_needed
-from siq.inference.maximum_likelihood import SUBSTEP_ERROR, Fit
+from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
 from siq.inference.recalibration import (
     fit_with_and_without_process_noise,
@@ -118,7 +118,7 @@ def _fitted_term(
                 begun = replace(begun, noise=replace(begun.noise, process=fit.noise.process))
             trial = fit_with_process_noise_as_needed(model, data, begun, level=level, budget=budget)
             # A function may be steeper than the simulation, whose steps are then too long to follow it.
-            needed = substeps_needed(trial.model, data, trial.model.values, trial.x, tolerance=SUBSTEP_ERROR)
+            needed = substeps_needed(trial.model, data, trial.model.values, trial.x)
             if trial.converged and needed > trial.substeps:
                 finer = replace(trial, substeps=needed)
                 trial = fit_with_process_noise_as_needed(trial.model, data, finer, budget=budget)

@@ -146,14 +146,11 @@ def filter_recursion(
     count = len(places)
     size = count + outputs if scored else 0
     score = np.zeros(size)
-    information = np.zeros((size, size))
-    squares = np.zeros((size, size))
+    information, squares = np.zeros((size, size)), np.zeros((size, size))
     slopes = np.empty((size, dimension))  # derivatives of the mean
     bends = np.empty((size, dimension, dimension))  # derivatives of the covariance
-    turned = np.empty((size, dimension))
-    by_variance = np.empty(size)
-    by_innovation = np.empty(size)
-    single = np.empty(size)
+    turned, by_variance = np.empty((size, dimension)), np.empty(size)
+    by_innovation, single = np.empty(size), np.empty(size)
     stored = rows if kept else 0
     predicted = np.empty((stored, dimension))
     filtered = np.empty((stored, dimension))
@@ -161,10 +158,8 @@ def filter_recursion(
     after = np.empty((stored, dimension, dimension))
     gains = np.zeros((stored, outputs, dimension))
     variances = np.ones((stored, outputs))
-    state = np.empty((dimension, width))
-    carried = np.empty((dimension, width))
-    half = np.empty((dimension, dimension))
-    gain = np.empty(dimension)
+    state, carried = np.empty((dimension, width)), np.empty((dimension, width))
+    half, gain = np.empty((dimension, dimension)), np.empty(dimension)
     shown = np.empty(width)
     driven = np.empty((dimension * dimension, 2), dtype=np.int64)
     drives = 0
@@ -334,8 +329,7 @@ def smooth_backwards(
     carries no process noise. The arguments are those of `filter_recursion`, and what it keeps.
     """
     dimension, outputs = predicted.shape[1], residual.shape[1]
-    smoothed = predicted.copy()
-    adjoint = np.empty(dimension)
+    smoothed, adjoint = predicted.copy(), np.empty(dimension)
     carried = np.empty(dimension)
     for recording in range(len(first) - 1):
         adjoint[:] = 0.0

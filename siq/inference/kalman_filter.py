@@ -33,6 +33,7 @@ from siq.systems.dynamics import Dynamics, Input, ParametricFunctions, Signals, 
 
 INTERVALS = 1 << 14  # numerical: carried together, since their derivatives at three places are much to keep
 MAX_SUBSTEPS = 16
+SUBSTEP_ERROR = 3e-6  # of the spread of a state: far below what any sensor resolves
 INSIDE = 1e-9  # share of a substep by which its ends lie inside, where an input jumps between samples
 SLOWEST = 1.0  # of what is stationary: its rate times all the time that is recorded
 RANK = 1e-9  # numerical: singular values below this share of the largest are rounding
@@ -350,8 +351,9 @@ def _carried(
 
 
 def substeps_needed(
-    model: Dynamics, data: Measurements, values: np.ndarray, x: np.ndarray, *, tolerance: float
-) -> int:
+    model: Dynamics, data: Measurements, values: np.ndarray, x: np.ndarray, *,
+    tolerance: float = SUBSTEP_ERROR,
+) -> int:  # fmt: skip
     """Runge–Kutta steps in every interval, so that doubling them changes little.
 
     The tolerance is the root mean square change of the increments from states ``(n, d)`` that is allowed,

@@ -55,7 +55,6 @@ NONLINEAR = 0.5  # share of a step's effect that may be unforeseen before the st
 HARMLESS = 0.1  # of a filter's own corrections: what is unforeseen below that is corrected as they are
 RUNS_AWAY = "the simulation runs away between two samples"
 ITERATIONS = 25  # of a fit, at most
-SUBSTEP_ERROR = 3e-6  # of the spread of a state: far below what any sensor resolves
 SETTLED = 1e-4  # change of the innovations, squared and per sample, at which a fit has converged
 FINE = 1e-3  # the same of all innovations together, by the parameters: a thirtieth of a standard error
 STANDSTILL = 0.005  # change of the sum of squares over four steps, below which a fit moves to no avail
@@ -388,7 +387,7 @@ class _Shooting:
         filtered: bool = False, closed: ClosedFunctions | None = None, budget: Budget | None = None,
     ) -> None:  # fmt: skip
         if substeps is None:
-            substeps = substeps_needed(model, data, model.values, x, tolerance=SUBSTEP_ERROR)
+            substeps = substeps_needed(model, data, model.values, x)
         about_zero = 2 * np.where(x.any(axis=0), np.abs(x).max(axis=0), 1.0)
         wide = np.ptp(model.limits, axis=1)
         resting = RESTING * np.where(np.isfinite(wide), wide, about_zero)

@@ -191,7 +191,8 @@ def measurements(recordings: Recordings, model: Dynamics) -> Measurements:
     """Lay recordings out as the model needs them: its outputs, and the courses of its inputs.
 
     Their columns are outputs, then inputs. An input of which nothing else is said is held
-    between samples where it was recorded as a staircase, whose changes have no other right behind.
+    between samples where it was recorded as a staircase, whose changes have no other right behind, and
+    which does not drift between them.
 
     Raises
     ------
@@ -201,8 +202,10 @@ def measurements(recordings: Recordings, model: Dynamics) -> Measurements:
     count = len(model.outputs)
     first = np.searchsorted(recordings.recording, np.arange(len(recordings.labels) + 1))
     within = np.diff(recordings.recording) == 0  # one recording may end far from where the next begins
-    changes = np.diff(recordings.values[:, count:], axis=0) ** 2 * within[:, None]
-    staircase = np.minimum(changes[1:], changes[:-1]).sum(axis=0) < STAIRCASE * changes.sum(axis=0)
+    changes = np.diff(recordings.values[:, count:], axis=0) * within[:, None]
+    small = np.where((squares := changes**2) < squares.mean(axis=0), changes, 0.0)
+    staircase = np.minimum(squares[1:], squares[:-1]).sum(axis=0) < STAIRCASE * squares.sum(axis=0)
+    staircase &= (small[1:] * small[:-1]).sum(axis=0) <= 0
     courses = []
     for begin, end in itertools.pairwise(first):
         t, mine = recordings.t[begin:end], []

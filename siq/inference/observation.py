@@ -84,8 +84,7 @@ def velocity_names(positions: Sequence[str]) -> tuple[str, ...]:
 
 def _seen_positions(plain: Dynamics) -> Dynamics:
     """Dynamics of forces alone, with ``dx/dt = v`` and with positions for their outputs."""
-    half = plain.dimension // 2
-    symbols = plain.symbols
+    half, symbols = plain.dimension // 2, plain.symbols
     outputs = tuple(zip(plain.states[:half], symbols[:half], strict=True))
     equations = (*symbols[half:], *plain.equations[half:])
     return Dynamics(plain.states, equations, plain.diffusion, parameters=plain.parameters, outputs=outputs)

@@ -36,14 +36,12 @@ def _run_tape(
     begin: np.ndarray, signals: np.ndarray, step: np.ndarray, states: np.ndarray,
 ) -> None:  # fmt: skip
     """Integrate recordings by the Runge–Kutta rule, sample after sample, into `states`."""
-    dimension = begin.shape[1]
-    known = signals.shape[1]
+    dimension, known = begin.shape[1], signals.shape[1]
     substeps = signals.shape[0] // 3
     node = (0, 1, 1, 2)
     reach = (0.0, 0.5, 0.5, 1.0)
     weight = (1.0, 2.0, 2.0, 1.0)
-    slope = np.empty(dimension)
-    total = np.empty(dimension)
+    slope, total = np.empty(dimension), np.empty(dimension)
     interval = 0
     for recording in range(len(first) - 1):
         last = interval + first[recording + 1] - first[recording] - 1

@@ -192,8 +192,7 @@ def _initial_coefficients(
 ) -> np.ndarray:  # fmt: skip
     """Ξ⁰ of Appendix A: V and g regressed on their own, f from both."""
     d = library.dimension
-    scaled = np.zeros_like(goals)
-    targets = np.arange(goals.shape[1])
+    scaled, targets = np.zeros_like(goals), np.arange(goals.shape[1])
     for chosen, allowed in (
         (targets[d : d + 1], library.in_potential),
         (targets[d + 1 :], library.in_circulatory),

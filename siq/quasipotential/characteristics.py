@@ -341,8 +341,7 @@ def characteristics(
     count = len(initial)
     states, times, ends = initial.copy(), np.zeros(count), np.full(count, End.STALLED, dtype=int)
     steps = np.full(count, 0.1 / np.linalg.norm(flow.relaxation, 2))
-    last_steps = np.zeros(count)
-    running = np.arange(count)
+    last_steps, running = np.zeros(count), np.arange(count)
     kept, kept_curves = [initial], [running]
     for _ in range(most_steps):
         if not len(running):

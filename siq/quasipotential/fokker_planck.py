@@ -453,8 +453,7 @@ class CellProcess:
 
         `backwards` takes the reversed process, of which u has no source.
         """
-        free = np.flatnonzero(np.isnan(given))
-        found = np.nan_to_num(given, nan=0.0)
+        free, found = np.flatnonzero(np.isnan(given)), np.nan_to_num(given, nan=0.0)
         operator = self.rates
         if backwards:  # of the reversed process only ratios count: π_j L_ji, row by row
             operator = (sparse.diags(np.maximum(self.density, np.finfo(float).tiny)) @ operator).T.tocsr()

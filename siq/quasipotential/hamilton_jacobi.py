@@ -373,8 +373,7 @@ class HamiltonJacobi:
                 pass
             if step is None:  # directions that the points do not determine are left as they are
                 step = np.linalg.lstsq(matrix, -residual, rcond=1e-11)[0]
-            step = step / scale[free]
-            length = 1.0
+            step, length = step / scale[free], 1.0
             while True:
                 trial = coefficients.copy()
                 trial[free] += length * step

@@ -561,8 +561,7 @@ def _imposed(m: np.ndarray, velocity: np.ndarray, force: np.ndarray) -> np.ndarr
     """The symmetric matrix that maps a velocity to a force, and is m across the velocity."""
     speed = np.linalg.norm(velocity)
     u, w = velocity / speed, force / speed
-    across = np.eye(len(u)) - np.outer(u, u)
-    mixed = np.outer(u, w)
+    across, mixed = np.eye(len(u)) - np.outer(u, u), np.outer(u, w)
     return across @ m @ across + mixed + mixed.T - (u @ w) * np.outer(u, u)
 
 

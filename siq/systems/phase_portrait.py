@@ -506,8 +506,7 @@ class RecordedRegion:
     @classmethod
     def of_basin(cls, portrait: PhasePortrait, index: int) -> RecordedRegion:
         """The region of ``portrait.attractors[index]``, in shares of the recorded box."""
-        descents = portrait.descents
-        others = portrait.states_elsewhere(index)
+        descents, others = portrait.descents, portrait.states_elsewhere(index)
         away = [descents.paths[descents.ends != index][:, 0], *([] if others is None else [others])]
         basin, box = portrait.basins[index], portrait.box
         return cls(basin.points(np.arange(len(basin.chosen))), np.concatenate(away), np.ptp(box, axis=1))

@@ -314,6 +314,8 @@ SCREENED = (
     "flow over a weir", "limiting resource", "Joule heating", "dependence on an input",
     "washout", "unbalance", "lever arm", "ground effect", "pull across a gap", "overpotential",
     "sigmoid feedback", "competition", "mutualism", "linear and quadratic drag", "Richards growth",
+    "temperature dependence", "latent heat", "limited throughput", "gas spring", "fatigue or depletion",
+    "pressure of a flow", "lag phase",
 )  # fmt: skip
 
 
@@ -754,6 +756,91 @@ def test_a_body_radiates_with_the_fourth_power_of_its_absolute_temperature() -> 
     c, s = sympy.Symbol("c_1", real=True), sympy.Symbol("s", real=True)
     assert in_kelvin == -c * s**4
     assert float(in_celsius.subs({c: 1, s: 20})) == pytest.approx(float(in_kelvin.subs({c: 1, s: 293.15})))
+
+
+def test_a_rate_grows_with_the_temperature_by_its_energy_of_activation() -> None:
+    # Arrhenius (1889): 50 kJ/mol make a rate 1.924 times as fast at 35 °C as at 25 °C.
+    at = the("temperature dependence", "heated reactor").model.equations[0]
+    c, k, s, u = (next(e for e in at.free_symbols if e.name == name) for name in ("c_1", "k", "s", "u"))
+    rate = -at.coeff(s).subs({k: 1, c: 50_000 / (8.314462618 * 273.15)})
+    assert float(rate.subs(u, 35) / rate.subs(u, 25)) == pytest.approx(1.924, abs=5e-4)
+    assert float(rate.subs(u, 0)) == 1.0
+
+
+def changed(name: str, home: str, state: str, label: str = "") -> tuple[sympy.Expr, dict[str, sympy.Symbol]]:
+    """What a mechanism adds to the equation of a state, and the symbols in it by name."""
+    change = dict(the(name, home, label).changes)[state]
+    return change, {each.name: each for each in change.free_symbols}
+
+
+def test_ice_takes_its_latent_heat_to_melt() -> None:
+    # Bonacina et al. (1973): what is taken up between two temperatures is the integral of the heat capacity,
+    # here 1 + 8 exp(-((T - 60)/5)²), with the latent heat 8 √π 5.
+    change, names = changed("latent heat", "kettle", "s")
+    values = {names["c_1"]: 8.0, names["m_1"]: 60.0, names["w_1"]: 5.0, names["u"]: 1.0}
+    values |= {names["g"]: 1.0, names["h"]: 0.0}
+    rate = sympy.lambdify(names["s"], (1 + change).subs(values))
+    at = np.linspace(30.0, 90.0, 2001)
+    taken = np.trapezoid([1 / rate(one) for one in at], at)
+    assert taken == pytest.approx(60 + 8 * np.sqrt(np.pi) * 5, rel=1e-6)
+
+
+def test_a_gas_pushes_back_by_its_pressure() -> None:
+    # Poisson: p V^n stays, so that at half the height the pressure is 2^n times that at rest.
+    change, names = changed("gas spring", "mass", "v")
+    force = change.subs({names["c_1"]: 1, names["h_1"]: 2.0, names["n_1"]: 1.3})
+    assert float(force.subs(names["x"], -1.0)) == pytest.approx(2**1.3 - 1)
+    assert float(force.subs(names["x"], 0.0)) == 0.0
+
+
+def test_no_more_is_served_than_can_be() -> None:
+    # Daganzo (1994): the flow is the lesser of what waits over a time and a capacity.
+    change, names = changed("limited throughput", "heat", "r", label="in r")
+    waiting = [0.5, 2.0, 5.0]
+    added = [float(change.subs({names["c_1"]: 0.2, names["L_1"]: 1.5, names["r"]: one})) for one in waiting]
+    assert [0.2 * one - more for one, more in zip(waiting, added, strict=True)] == pytest.approx(
+        [min(0.2 * one, 0.3) for one in waiting]
+    )
+
+
+def test_what_an_input_uses_up_comes_back_in_time() -> None:
+    # Tsodyks and Markram (1997): of the resources R, u U R are used and (1 - R)/τ come back. In the long run
+    # R = 1/(1 + u U τ).
+    candidate = the("fatigue or depletion", "circuit")
+    driven, own = candidate.model.equations
+    names = {each.name: each for each in driven.free_symbols | own.free_symbols}
+    z, c, u = names[candidate.model.states[-1]], names["c_1"], names["u"]
+    at_rest = sympy.solve(own, z)[0]
+    assert sympy.simplify((1 - c * at_rest) - 1 / (1 + c * u)) == 0  # with c = U τ
+    values = {names["g"]: 1.0, names["s"]: 0.0, c: 0.5, u: 2.0}
+    assert float(driven.subs(values).subs(z, 0.4)) == pytest.approx(2.0 * (1 - 0.5 * 0.4))
+
+
+def test_wind_pushes_with_the_square_of_its_speed() -> None:
+    change, names = changed("pressure of a flow", "wind turbine", "w")
+    pushes = [float(change.subs({names["c_1"]: 0.5, names["u"]: one})) for one in (-2.0, 1.0, 2.0)]
+    assert pushes == [-2.0, 0.5, 2.0]
+    assert not [each for each in candidates(HOMES["wind turbine"].model) if "propeller" in each.name]
+
+
+def test_friction_that_creeps_is_dry_friction_beyond_its_width() -> None:
+    change = dict(the("dry friction", "mass", "creeps").changes)["v"]
+    names = {each.name: each for each in change.free_symbols}
+    values = {names["c_1"]: 2.0, names["w_1"]: 0.1}
+    forces = [float(change.subs(values).subs(names["v"], one)) for one in (-1.0, 0.01, 1.0)]
+    assert forces == pytest.approx([2.0, -0.2, -2.0], rel=5e-3)
+
+
+def test_before_they_grow_bacteria_get_ready() -> None:
+    # Baranyi and Roberts (1994): growth times q/(1 + q) with dq/dt = νq.
+    change = dict(the("lag phase", "crop").changes)["n"]
+    names = {each.name: each for each in change.free_symbols}
+    n, t = names["n"], names["t"]
+    growth = n - sympy.Rational(1, 5) * n**2
+    values = {names["r"]: 1, names["c"]: sympy.Rational(1, 5), names["c_1"]: 1}
+    share = sympy.simplify(1 + change.subs(values) / growth).subs({names["n_1"]: 0.9, names["l_1"]: 3.0})
+    q = np.exp(0.9 * (np.array([0.5, 2.0, 3.0, 6.0]) - 3.0))
+    np.testing.assert_allclose([float(share.subs(t, one)) for one in (0.5, 2.0, 3.0, 6.0)], q / (1 + q))
 
 
 def test_water_evaporates_by_the_pressure_of_its_vapour() -> None:
