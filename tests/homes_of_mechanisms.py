@@ -488,6 +488,18 @@ HOMES: Mapping[str, Home] = {
         lambda rng: rng.uniform(1.0, 4.0, size=1),
         lambda rng, t: np.concatenate([inflow(rng, t, size=1.5), 2.0 + waves(rng, t)]),
     ),
+    "salt mixer": Home(
+        {
+            "time_unit": "min",
+            "states": states(s="g/L"),
+            "inputs": {"u": {"unit": "L/min", "interpolation": "zero_order"}, "w": {"unit": "g/L"}},
+            "parameters": numbers(k=0.2),
+            "equations": {"s": "-k*s"},
+        },
+        0.3,
+        lambda rng: rng.uniform(1.0, 4.0, size=1),
+        lambda rng, t: np.concatenate([inflow(rng, t, size=1.5), 2.0 + waves(rng, t)]),
+    ),
     "culture": Home(
         {
             "time_unit": "h",
@@ -829,8 +841,10 @@ RESIDENTS: Sequence[Resident] = (
     Resident("maturation delay", "crop", {"tau": 2.0}, "one length"),
     Resident("delayed self-limitation", "crop", {"tau": 0.8}),
     Resident("washout", "fermenter with a feed", {"c": 0.3}),
-    Resident("washout", "mixer", {"c": 0.3, "d": 0.8}),
-    Resident("washout", "mixer", {"c": 0.3}, "by what has w"),
+    Resident("washout", "salt mixer", {"c": 0.3, "d": 0.8}),
+    Resident("washout", "salt mixer", {"c": 0.3}, "by what has w"),
+    Resident("exchange with a flow", "mixer", {"c": 0.3, "d": 0.8}),
+    Resident("exchange with a flow", "mixer", {"c": 0.3}, "that has w"),
     Resident("saturated elimination", "heat", {"c": 1.0, "w": 1.0}, "in s"),
     Resident("diode or exponential loss", "circuit", {"c": 0.05, "w": 0.3}),
     Resident("thermal radiation", "furnace", {"c": 2e-10}),

@@ -76,6 +76,14 @@ EVEN = 0.5  # probability of a cause without a name, where nothing is known befo
 PLAUSIBLE = 0.05  # of the probability of a family, from which on a member is not ruled out
 
 
+def _thinned(data: Measurements, every: int) -> Measurements:
+    """Recordings of which only every so-manieth sample was measured."""
+    outputs = np.full_like(data.outputs, np.nan)
+    for begin, end in itertools.pairwise(data.first):
+        outputs[begin:end:every] = data.outputs[begin:end:every]
+    return replace(data, outputs=outputs)
+
+
 def _fold_of(data: Measurements) -> np.ndarray:
     """The part of each measured value, shape ``(n·m,)``: recordings, or stretches where these are few.
 
@@ -192,10 +200,7 @@ def _horizons_of(fit: Fit, context: FitContext) -> list[Horizon]:
         fit = replace(fit, noise=first_noise(fit.model, data, fit.x))
     parameters = len(fit.model.free) + 1
     while True:
-        outputs = np.full_like(data.outputs, np.nan)  # but of every so-manieth sample
-        for first, end in itertools.pairwise(data.first):
-            outputs[first:end:every] = data.outputs[first:end:every]
-        some = replace(data, outputs=outputs)
+        some = _thinned(data, every)
         known = int(np.isfinite(some.outputs).sum()) - fit.model.dimension * len(data.labels)
         if found and known < SAMPLES_PER_PARAMETER * parameters:
             return found

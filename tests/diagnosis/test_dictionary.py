@@ -315,7 +315,7 @@ SCREENED = (
     "washout", "unbalance", "lever arm", "ground effect", "pull across a gap", "overpotential",
     "sigmoid feedback", "competition", "mutualism", "linear and quadratic drag", "Richards growth",
     "temperature dependence", "latent heat", "limited throughput", "gas spring", "fatigue or depletion",
-    "pressure of a flow", "lag phase",
+    "pressure of a flow", "lag phase", "exchange with a flow",
 )  # fmt: skip
 
 
@@ -557,7 +557,7 @@ def test_a_parameter_goes_with_an_input_in_proportion() -> None:
 
 def test_what_flows_through_carries_off_what_is_there() -> None:
     # Fogler (2016): V dC/dt = v (C_in - C) of a stirred tank; Novick and Szilard (1950): nothing flows in.
-    change = dict(the("washout", "mixer", "by what has w").changes)["s"]
+    change = dict(the("washout", "salt mixer", "by what has w").changes)["s"]
     c, u, w, s = (next(e for e in change.free_symbols if e.name == name) for name in ("c_1", "u", "w", "s"))
     assert change.subs({c: 2, u: 3, w: 5, s: 1}) == 24 and change.subs({c: 2, u: 3, w: 1, s: 1}) == 0
     change = dict(the("washout", "fermenter with a feed").changes)["n"]

@@ -31,7 +31,7 @@ NAMES = (
     "parameter drift", "dependence on an input", "temperature dependence", "periodic forcing", "lever arm",
     "unbalance", "overflow", "flow over a weir", "leak", "input delay", "hysteresis",
     "viscoelastic relaxation", "saturated elimination", "limited throughput", "second-order reaction",
-    "washout", "diode or exponential loss", "latent heat", "cooling by evaporation",
+    "washout", "exchange with a flow", "diode or exponential loss", "latent heat", "cooling by evaporation",
     "outflow through an opening", "thermal radiation", "reverse reaction or backflow", "adaptation",
     "waning immunity", "recruitment", "seasonality", "process noise", "sensor gain or offset",
     "thermal drift", "sensor lag", "quantisation", "rectification", "clipping", "input gain",
