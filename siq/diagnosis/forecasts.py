@@ -59,6 +59,7 @@ from siq.systems.dynamics import Dynamics
 
 LOGGER = logging.getLogger(__name__)
 THINNING = 4  # from one horizon to the next: a choice
+TRIALS = 2  # families that may have a companion, where nothing is certain alone: a choice
 # At a horizon, at least, beside the initial states: a choice. With three a parameter, most explanations of a
 # motor's recordings foresaw parts left out far worse than none did.
 SAMPLES_PER_PARAMETER = 10
@@ -567,8 +568,8 @@ def _next_rung(
 ) -> _Rung | None:  # fmt: skip
     """The mechanism that stands first on top of fits; None where none is likelier than what has no name.
 
-    Then the one that comes first all the same is put on trial, where a list for that is given. One that is
-    asked for by its label is fitted whatever it promises.
+    Then the two of different families that come first all the same are put on trial, where a list for that is
+    given. One that is asked for by its label is fitted whatever it promises.
     """
     options, base, budget = context.study.search, horizons[0].fit, context.budget
     budget.says("comparing forecasts of what was left out")
@@ -732,7 +733,8 @@ def _next_rung(
     general = np.array([site.candidate is None for site in sites]) & family & likelier
     if log_odds < options.least_log_odds or general.any():
         if on_trial is not None:
-            on_trial.append(max(leading, key=lambda each: each.weight))
+            ahead = {each.site.family: each for each in sorted(leading, key=lambda each: each.weight)}
+            on_trial += sorted(ahead.values(), key=lambda each: -each.weight)[:TRIALS]
         return None
     members = {sites[k].label: weights[k] for k in np.flatnonzero(family) if sites[k].candidate is not None}
     alike = {label for label, weight in members.items() if weight > leader.weight + np.log(PLAUSIBLE)}
@@ -911,7 +913,9 @@ def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[_Rung], li
             on_trial, names = list[_Leader](), [each.accepted.best.candidate for each in found]
             with budget.part(1.0 if found else FIRST_NAME_SHARE):
                 rung = next_on(names, found[-1].horizons if found else alone, None if found else on_trial)
-                rungs = [rung] if rung is not None else together_with(*on_trial) if on_trial else []
+                rungs = [rung] if rung is not None else []
+                for leader in on_trial:
+                    rungs = rungs or together_with(leader)
             if not rungs:
                 break
             together |= len(rungs) > 1
