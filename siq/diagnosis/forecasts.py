@@ -733,8 +733,8 @@ def _next_rung(
     general = np.array([site.candidate is None for site in sites]) & family & likelier
     if log_odds < options.least_log_odds or general.any():
         if on_trial is not None:
-            ahead = {each.site.family: each for each in sorted(leading, key=lambda each: each.weight)}
-            on_trial += sorted(ahead.values(), key=lambda each: -each.weight)[:TRIALS]
+            foremost = {each.site.family: each for each in sorted(leading, key=lambda each: each.weight)}
+            on_trial += sorted(foremost.values(), key=lambda each: -each.weight)[:TRIALS]
         return None
     members = {sites[k].label: weights[k] for k in np.flatnonzero(family) if sites[k].candidate is not None}
     alike = {label for label, weight in members.items() if weight > leader.weight + np.log(PLAUSIBLE)}
