@@ -18,6 +18,7 @@ from homes_of_mechanisms import (
     numbers,
     recorded as recorded_at_home,
     states,
+    truth_of,
 )
 
 from siq.data.recordings import Recordings
@@ -389,6 +390,19 @@ def test_what_came_first_is_exchanged_for_what_foresees_better_beside_the_rest(
     found = [first, rung(first.horizons, "linear damping")]
     names = [each.accepted.best.candidate.name for each in _exchanged(found, alone, context)]
     assert names == (["linear damping", truth] if truth == "actuator lag" else [truth, "linear damping"])
+
+
+def test_a_state_that_a_mechanism_brings_may_be_faster_than_the_simulation() -> None:
+    """Bouc and Wen's z forgets at the rate b|v|: up to 8 times a step, where the simulation needs one."""
+    resident = Resident("hysteresis", "mass", {"c": 2.0, "b": 1.5, "g": 0.0})
+    candidate, data = truth_of(resident), recorded_at_home(resident)
+    fit, _ = recalibrate(HOMES["mass"].model, data)
+    steep = 8.0 / float(np.median(data.step) * np.abs(fit.x[:, 1]).max())
+    _, x = Probe(candidate, (("b_1", steep), ("g_1", 0.0))).begin(fit, data, fit.x)
+    assert np.isfinite(x).all() and np.abs(x[:, 2]).max() < 2 / steep  # |z| is 1/b at most in the long run
+    model = candidate.begun(fit.model, {"b_1": steep / 4, "g_1": 0.0, "c_1": 2.0})
+    found = forecasts._fitted(model, data, fit, x, data.roughness, budget=Budget())
+    assert found.substeps > fit.substeps
 
 
 def test_two_that_are_certain_only_beside_each_other_are_both_found() -> None:

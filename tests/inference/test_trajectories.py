@@ -315,6 +315,8 @@ def test_an_input_that_was_recorded_as_a_staircase_is_held_between_samples() -> 
     assert course_of(coarse) == "held"
     # One recording may end far from where the next begins, which is no step.
     assert course_of(np.where(t < 200, np.sin(t / 7), 30.0 + np.sin(t / 5))) == "joined"
+    # What drifts between its jumps, as the sun between clouds does, was not held.
+    assert course_of(10 * stairs + np.sin(t / 7)) == "joined"
     for smooth in (np.sin(t / 7), generator.normal(size=400), np.abs(t % 40 - 20.0), np.ones(400) * t):
         assert course_of(smooth) == "joined"
     assert course_of(stairs, interpolation="linear") == "joined"
