@@ -426,7 +426,7 @@ def test_two_that_are_certain_only_beside_each_other_are_both_found() -> None:
     }  # fmt: skip
     model = model_of(card)
     data = measurements(Recordings.from_frame(pd.concat(tables), columns=["T", "q"]), model)
-    some = ("thermal radiation", "sensor lag", "washout", "constant bias")
+    some = ("thermal radiation", "sensor lag", "exchange with a flow", "constant bias")
     context = context_of(model, data, some)
     assert first_rung(context) is None
     _, found, *_ = climb(recalibrate(model, data)[0], context)
