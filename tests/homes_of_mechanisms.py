@@ -116,6 +116,22 @@ def warmed(
     return Home(card, 0.5, lambda rng: rng.uniform(*begin, size=1), lambda rng, t: inflow(rng, t, size=size))
 
 
+def mixed(unit: str) -> Home:
+    """A stirred tank through which u flows, which brings w of what s is of."""
+    card = {
+        "time_unit": "min",
+        "states": states(s=unit),
+        "inputs": {"u": {"unit": "L/min", "interpolation": "zero_order"}, "w": {"unit": unit}},
+        "parameters": numbers(k=0.2),
+        "equations": {"s": "-k*s"},
+    }
+
+    def course(rng: np.random.Generator, t: np.ndarray) -> np.ndarray:
+        return np.concatenate([inflow(rng, t, size=1.5), 2.0 + waves(rng, t)])
+
+    return Home(card, 0.3, lambda rng: rng.uniform(1.0, 4.0, size=1), course)
+
+
 HOMES: Mapping[str, Home] = {
     "mass": Home(
         {
@@ -476,30 +492,8 @@ HOMES: Mapping[str, Home] = {
         lambda rng: np.array([rng.uniform(0.3, 4)]),
         lambda rng, t: inflow(rng, t, size=1.5),
     ),
-    "mixer": Home(
-        {
-            "time_unit": "min",
-            "states": states(s="K"),
-            "inputs": {"u": {"unit": "L/min", "interpolation": "zero_order"}, "w": {"unit": "K"}},
-            "parameters": numbers(k=0.2),
-            "equations": {"s": "-k*s"},
-        },
-        0.3,
-        lambda rng: rng.uniform(1.0, 4.0, size=1),
-        lambda rng, t: np.concatenate([inflow(rng, t, size=1.5), 2.0 + waves(rng, t)]),
-    ),
-    "salt mixer": Home(
-        {
-            "time_unit": "min",
-            "states": states(s="g/L"),
-            "inputs": {"u": {"unit": "L/min", "interpolation": "zero_order"}, "w": {"unit": "g/L"}},
-            "parameters": numbers(k=0.2),
-            "equations": {"s": "-k*s"},
-        },
-        0.3,
-        lambda rng: rng.uniform(1.0, 4.0, size=1),
-        lambda rng, t: np.concatenate([inflow(rng, t, size=1.5), 2.0 + waves(rng, t)]),
-    ),
+    "mixer": mixed("K"),
+    "salt mixer": mixed("g/L"),
     "culture": Home(
         {
             "time_unit": "h",

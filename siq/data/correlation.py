@@ -75,7 +75,7 @@ MOST_SAMPLES = 400_000  # looked at: a correlation is then known to 0.002
 LAG_GROWTH = 1.2  # of the lags that are tried, about as exactly as they are known
 NOISE_FREE_RESIDUAL = 1e-3  # of the rms step: less is left where nothing but the integrator erred
 MIN_CHI2_GAIN = 6.0  # the other is e³ = 20 times less likely, or a further number worth its while
-TAILS_KNOWN = 0.1  # as D(x) makes others: a choice
+TAILS_KNOWN = 0.1  # of those of normal noise, since a D(x) makes some, too: a choice
 MEMORIES_TRIED = 40  # before the best is refined
 EIGENVALUE_FLOOR = 1e-9  # of the largest, so that a covariance can be inverted
 

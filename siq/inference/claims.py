@@ -32,7 +32,7 @@ of the past alone, and then the products ``G z`` are martingale differences, wha
     two values would not show in that, it is not tested.
 
 ``regular_clock``
-    Of samples that were taken at other times than it is said: as with these, no claim on times is tested.
+    Not tested where samples were taken at other times than it is said: times are no better than their clock.
 
 Of the neighbouring residual `siq.inference.checks` judges, which knows sensors and rounding: what it explains
 is left out here, and the past begins two steps back.

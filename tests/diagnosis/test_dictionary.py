@@ -557,9 +557,10 @@ def test_a_parameter_goes_with_an_input_in_proportion() -> None:
 
 def test_what_flows_through_carries_off_what_is_there() -> None:
     # Fogler (2016): V dC/dt = v (C_in - C) of a stirred tank; Novick and Szilard (1950): nothing flows in.
-    change = dict(the("washout", "salt mixer", "by what has w").changes)["s"]
-    c, u, w, s = (next(e for e in change.free_symbols if e.name == name) for name in ("c_1", "u", "w", "s"))
-    assert change.subs({c: 2, u: 3, w: 5, s: 1}) == 24 and change.subs({c: 2, u: 3, w: 1, s: 1}) == 0
+    for name, home in (("washout", "salt mixer"), ("exchange with a flow", "mixer")):
+        change = dict(the(name, home, "has w").changes)["s"]
+        c, u, w, s = (next(e for e in change.free_symbols if e.name == k) for k in ("c_1", "u", "w", "s"))
+        assert change.subs({c: 2, u: 3, w: 5, s: 1}) == 24 and change.subs({c: 2, u: 3, w: 1, s: 1}) == 0
     change = dict(the("washout", "fermenter with a feed").changes)["n"]
     c, u, n = (next(e for e in change.free_symbols if e.name == name) for name in ("c_1", "u", "n"))
     assert change.subs({c: 2, u: 3, n: 4}) == -24
@@ -765,6 +766,14 @@ def test_a_rate_grows_with_the_temperature_by_its_energy_of_activation() -> None
     rate = -at.coeff(s).subs({k: 1, c: 50_000 / (8.314462618 * 273.15)})
     assert float(rate.subs(u, 35) / rate.subs(u, 25)) == pytest.approx(1.924, abs=5e-4)
     assert float(rate.subs(u, 0)) == 1.0
+    # The same of a state, and in kelvin.
+    for unit, zero in (("K", 273.15), ("°C", 0.0)):
+        card = {"states": states(s=unit), "parameters": numbers(k=1.0), "equations": {"s": "1 - k*s"}}
+        own = next(each for each in candidates(model_of(card)) if each.name == "temperature dependence")
+        names = {each.name: each for each in own.model.equations[0].free_symbols}
+        values = {names["k"]: 1.0, names["c_1"]: 20.0}
+        faster = sympy.lambdify(names["s"], (1 - own.model.equations[0].subs(values)) / names["s"])
+        assert faster(zero + 35) == pytest.approx(float(np.exp(20 * 35 / (35 + 273.15))))
 
 
 def changed(name: str, home: str, state: str, label: str = "") -> tuple[sympy.Expr, dict[str, sympy.Symbol]]:

@@ -98,13 +98,10 @@ def test_a_refusal_carries_the_states_of_the_record() -> None:
 def test_a_landscape_that_misses_the_states_says_so_as_the_page_does() -> None:
     line = PipelineSettings(identification=IdentificationOptions(degree=1))
     landscape = Landscape.from_recordings(double_well(), line)
-    assert (
-        len(landscape.attractors) == 1
-        and landscape.recorded_states is not None
-        and landscape.recorded_states.supported
-    )
+    seen = landscape.recorded_states
+    assert len(landscape.attractors) == 1 and seen is not None and seen.supported
     first, _, second, *_ = landscape.report().splitlines()
-    assert first == landscape.recorded_states.sentence()
+    assert first == seen.sentence()
     assert second.startswith("What was identified misses them: the recordings show one stable state")
 
 

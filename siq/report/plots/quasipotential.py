@@ -261,7 +261,7 @@ def _draw_curve(axes: Axes, landscape: LandscapeSummary) -> list[Any]:
         axes.fill_between(x, values - 2 * error, values + 2 * error, color=BLUE, alpha=0.25, linewidth=0)
         handles.append(Patch(color=BLUE, alpha=0.25, label="± 2 standard errors"))
     axes.plot(x, values, color=BLUE, linewidth=1.8)
-    axes.set_ylim(lowest - (3 if len(handles) else 1) * (0.06 * (top - lowest)), top)
+    axes.set_ylim(lowest - (3 if len(handles) else 1) * 0.06 * (top - lowest), top)
     axes.set_xlim(*landscape.box[0])
     if landscape.points is not None and len(landscape.points):
         thinned = landscape.points[:: max(len(landscape.points) // MOST_POINTS, 1), 0]
