@@ -828,8 +828,6 @@ def _on_top(horizons: Sequence[Horizon], rung: _Rung, context: FitContext) -> _R
     """The mechanism of a rung fitted on top of other fits; None where it does not settle there."""
     base, label = horizons[0].fit, rung.accepted.best.candidate.label
     (plain,) = (each for each in context.candidates if each.label == label)
-    if min(base.model.dimension, plain.model.dimension) > context.model.dimension:
-        return None
     candidate = plain.rebased(context.model, base.model)
     for probe in Probe.along(candidate, base, context.data):
         failed, site = dict[str, NotFitted](), _Site((probe,), 0.0, 0.0, ("", ()), candidate)
@@ -889,7 +887,6 @@ def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[_Rung], li
             each.rebased(model, base) if below else each
             for each in context.candidates
             if not any(each.repeats(other) for other in below)
-            and min(base.dimension, each.model.dimension) == model.dimension
         ]
         return _next_rung(horizons, remaining, context, untried, on_trial, asked)
 

@@ -439,6 +439,37 @@ def test_two_that_are_certain_only_beside_each_other_are_both_found() -> None:
     assert fit.model.states == ("T", "z_1")
 
 
+def test_a_lag_and_a_hidden_capacity_each_with_a_state_are_found_one_on_the_other() -> None:
+    """A room whose walls take up heat, and a sensor that follows late."""
+    draw, t, h = np.random.default_rng(6), np.arange(150) / 12, 1 / 120
+    tables = []
+    for place in range(2):
+        heat, seen = np.repeat(draw.choice([0.0, 2.0, 4.0], 15), 10), np.empty(len(t))
+        room, wall, shown = 12.0, 12.0, 12.0
+        for row in range(len(t)):
+            seen[row] = shown
+            for _ in range(10):
+                change = np.array([(5 - room) / 8 + heat[row] - (room - wall), (room - wall) / 1.5])
+                shown += h * (room - shown) / 0.15
+                room, wall = np.array([room, wall]) + h * change
+        shown_with_noise = seen + 0.01 * draw.normal(size=len(t))
+        tables.append(pd.DataFrame({"recording": f"r{place}", "t": t, "T": shown_with_noise, "q": heat}))
+    card = {
+        "time_unit": "h", "states": {"T": {"unit": "degC"}},
+        "inputs": {"q": {"unit": "kW", "interpolation": "zero_order"}},
+        "parameters": numbers(tau=10.0, C=2.0), "equations": {"T": "(5 - T)/tau + q/C"},
+    }  # fmt: skip
+    model = model_of(card)
+    data = measurements(Recordings.from_frame(pd.concat(tables), columns=["T", "q"]), model)
+    some = ("hidden capacity", "sensor lag", "input delay", "constant bias")
+    _, found, *_ = climb(recalibrate(model, data)[0], context_of(model, data, some))
+    assert {each.accepted.best.candidate.name for each in found} == {"hidden capacity", "sensor lag"}
+    values = {each.name: each.value for each in found[-1].accepted.best.fit.model.parameters}
+    lags = sorted(value for name, value in values.items() if name.startswith("tau_"))
+    assert lags == pytest.approx([0.15, 1.5], rel=0.05)
+    assert values["C"] == pytest.approx(1.0, rel=0.02) and values["tau"] == pytest.approx(8.0, rel=0.1)
+
+
 def test_a_general_form_whose_amplitude_is_zero_within_errors_is_its_special_case() -> None:
     best = damped().accepted.best
     fit, (amplitude,) = best.fit, best.candidate.amplitudes
