@@ -249,19 +249,23 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
     # Of several models, and ways to fit them, parts of what was learned from choose, each left out in turn.
     foreseen = [left_out(fit, [part.candidate for part in model.parts]) for model, fit in choices]
     sizes = [sum(len(part.candidate.new) for part in model.parts) for model, _ in choices]
-    best = preferred_model(foreseen, sizes) if choices else 0
-    adopted = False
+    best = chosen = preferred_model(foreseen, sizes) if choices else 0
+    adopted, waiting = False, dict(enumerate(foreseen))
     if choices and judges:
         # What is not certain where it was found, or what names leave, has to be better by more than appears
         # by chance, what is certain better than the simulation fitted alike. A card whose values are right
         # predicts well, and tells nothing of a function whose fit had to find them, too. Where there is
         # process noise a free run is off by it, and a little may be chance.
-        may_choose, (model, fit) = data.select(judges), choices[best]
+        may_choose = data.select(judges)
         alone = [errors_of(each, may_choose) for each in ((plain,) if named else (card, fitted_alike))]
         least = min((each for each in alone if each is not None), key=np.mean, default=None)
-        certain = not named and model.log_evidence >= study.search.least_log_odds
-        limit = mean_error(least if model.fit.has_process_noise else alone[-1]) if certain else 0.0
-        adopted = predicts_better(least, errors_of(fit, may_choose), limit=limit)
+        while waiting and not adopted:  # recordings held out may go where the best of them fails
+            chosen = list(waiting)[preferred_model([*waiting.values()], [sizes[one] for one in waiting])]
+            (model, fit), _ = choices[chosen], waiting.pop(chosen)
+            certain = not named and model.log_evidence >= study.search.least_log_odds
+            limit = mean_error(least if model.fit.has_process_noise else alone[-1]) if certain else 0.0
+            adopted = predicts_better(least, errors_of(fit, may_choose), limit=limit)
+        best = chosen if adopted else best
     elif choices:
         adopted = predicts_better(left_out(plain if named else search.recalibrated), foreseen[best])
     fit = choices[best][1] if adopted or (choices and not named) else plain
