@@ -265,6 +265,9 @@ def comparison_of(
                 column[apart] = np.nan
                 remarks.append(Remark("data.outliers", {"column": name, "samples": int(apart.sum())}))
         data = replace(data, outputs=cleared)
+    near = {each.name: f"{each.error:.3g}" for each in system.parameters if each.error and not each.fixed}
+    if near:
+        remarks.append(Remark("diagnosis.known_to", {"errors": near}))
     learn, kept = _split(data, settings, file=file)
     for name in settings.varies:
         if not any(each.name == name and each.value and not each.fixed for each in system.parameters):

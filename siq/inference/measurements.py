@@ -279,13 +279,16 @@ def expectations(model: Dynamics, values: np.ndarray | None = None) -> tuple[np.
     now = (model.values if values is None else values)[list(model.free)]
     free = {model.parameters[place].name: column for column, place in enumerate(model.free)}
     fixed = {each.name: each.value for each in model.parameters}
-    sizes = [model.parameters[place].expected or 0.0 for place in model.free]
+    entries = [model.parameters[place] for place in model.free]
+    sizes = [each.expected or 0.0 for each in entries]
     told = np.flatnonzero(sizes)
+    # In units of their size, by how much they may be off.
+    width = np.array([(entries[k].error or abs(sizes[k])) / abs(sizes[k]) for k in told])
     size, inverse = np.array(sizes)[told], np.isin(np.array(model.free)[told], [*model.divisors])
     # Of K about K₀, -K₀/K about -1: its change by K, and what is short of it where K is now.
     at = np.where(inverse, now[told], 1.0)
-    rows = [np.eye(len(free))[told] * np.where(inverse, size / at**2, 1 / np.abs(size))[:, None]]
-    middle = [np.where(inverse, 2 * size / at - 1, np.sign(size))]
+    rows = [np.eye(len(free))[told] * (np.where(inverse, size / at**2, 1 / np.abs(size)) / width)[:, None]]
+    middle = [np.where(inverse, 2 * size / at - 1, np.sign(size)) / width]
     for each in model.expected_together:
         mine = [place for place, name in enumerate(each.names) if name in free]
         if mine:

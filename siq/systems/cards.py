@@ -86,6 +86,7 @@ Formula = str | Number
 DiffusionEntry = Literal["identity"] | list[Formula] | list[list[Formula]]
 
 LINE_WIDTH = 110
+GRAVITY, GRAVITY_ERROR = 9.80, 0.03  # m/s², from mountains at the equator to the poles
 PERIODS_TRIED = 5  # states at which equations are compared with themselves a period on
 SAME_VALUE = 1e-9  # numerical, of their size
 LONGEST_NAME = 100  # letters: names of files have up to 255 bytes, of which two names may be a part
@@ -130,6 +131,16 @@ class ParameterEntry(_CardPart):
     value: Number  #: its value
     unit: str = "1"  #: for people
     fixed: bool = False  #: ``true`` when you are sure of the value: no recalibration changes it then
+    #: How far the value may be off: one standard deviation, in its unit. By default that is as large as the
+    #: value; of the acceleration of gravity in m/s² it is what this differs by on Earth, 0.03.
+    error: Annotated[Number, Field(gt=0)] | None = None
+
+    @property
+    def known_to(self) -> float | None:
+        """The error, as given or of the acceleration of gravity."""
+        unit = self.unit.replace(" ", "").replace("**", "^").replace("²", "^2")
+        of_gravity = unit == "m/s^2" and abs(abs(self.value) - GRAVITY) <= GRAVITY_ERROR
+        return GRAVITY_ERROR if self.error is None and of_gravity else self.error
 
 
 class InputEntry(_CardPart):
@@ -279,7 +290,8 @@ def build_system(document: Document, card: SystemCard) -> Dynamics:
         domain=np.array([one.domain or (np.nan, np.nan) for one in card.states.values()], dtype=float),
         inputs=tuple(Input(name, entry.unit, entry.interpolation) for name, entry in card.inputs.items()),
         parameters=tuple(
-            Parameter(name, entry.value, entry.unit, entry.fixed) for name, entry in card.parameters.items()
+            Parameter(name, entry.value, entry.unit, entry.fixed, error=entry.known_to)
+            for name, entry in card.parameters.items()
         ),
         equations=tuple(parse(("equations", name), card.equations[name]) for name in card.states),
         outputs=tuple((name, parse(("outputs", name), text)) for name, text in outputs.items()),
@@ -362,6 +374,7 @@ def card_of(dynamics: Dynamics) -> str:
         data["parameters"] = {
             entry.name: {"value": float(entry.value), "unit": entry.unit}
             | ({"fixed": True} if entry.fixed else {})
+            | ({} if entry.error is None else {"error": entry.error})
             for entry in dynamics.parameters
         }
     data["equations"] = {

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -61,6 +63,17 @@ def test_what_they_do_not_tell_stays_near_the_card() -> None:
     assert (np.abs(fit.model.values[1:3] - [0.5, 2.0]) < [0.05, 0.2]).all()
     # And is stated as known no better than within its own size.
     assert (fit.standard_errors[1:3] > [0.3, 1.2]).all() and (fit.standard_errors[1:3] < [0.6, 2.5]).all()
+
+
+def test_an_error_says_how_near() -> None:
+    entries = (Parameter("a", 1.0), Parameter("b", 0.5, error=0.01), Parameter("c", 2.0))
+    near = with_expectations(replace(model(), parameters=(*entries, Parameter("k", 0.3, fixed=True))))
+    rows, short = expectations(near, np.array([1.0, 0.48, 3.0, 0.3]))
+    np.testing.assert_allclose(np.diag(rows), [1.0, 100.0, 0.5])
+    np.testing.assert_allclose(short, [0.0, 2.0, -0.5])
+    fit, _ = recalibrate(near, recordings(model()))
+    assert fit.model.values[1] == pytest.approx(0.5, abs=0.01)
+    assert fit.standard_errors[1] == pytest.approx(0.01, rel=0.2)
 
 
 def test_whole_trajectories_end_where_steps_at_all_samples_do() -> None:

@@ -83,6 +83,21 @@ def test_a_formula_that_is_none_with_the_parameters_values_is_refused(write: Wri
     assert error.place == "line 9 (equations.p)"
 
 
+def test_gravity_is_known_unless_a_card_says_how_well(write: Write) -> None:
+    text = (
+        "name: fall\nstates: {x: {unit: m}, v: {unit: m/s}}\nequations: {x: v, v: -g + a}\n"
+        "parameters: {g: {value: 9.81, unit: 'm/s^2'}, a: {value: 9.81, unit: m/s, error: 0.2}}"
+    )
+    system = load_system(write(text))
+    assert [each.error for each in system.parameters] == [0.03, 0.2]
+    assert [each.error for each in load_system(write(system.to_card())).parameters] == [0.03, 0.2]
+    for value, unit, error in ((9.81, "m/s**2", 0.03), (9.81, "cm/s^2", None), (3.71, "m/s^2", None)):
+        other = text.replace("9.81, unit: 'm/s^2'", f"{value}, unit: '{unit}'")
+        assert load_system(write(other)).parameters[0].error == error
+    with pytest.raises(InputError, match="error"):
+        load_system(write(text.replace("error: 0.2", "error: -1")))
+
+
 def test_a_whole_parameter_may_be_an_exponent(write: Write) -> None:
     system = load_system(write(CARD.replace('p: "q"', 'p: "q**omega"')))
     assert system.formulas[0].is_polynomial(*system.symbols)
