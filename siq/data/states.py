@@ -389,7 +389,8 @@ class RecordStates:
         share = np.append(0, np.cumsum(self.density * np.diff(self.edges)))
         low, high = np.interp([(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], share, self.edges)
         values = {"state": self.state, "unit": self.unit, "low": float(low), "high": float(high)}
-        return Remark("data.record_rests", values)
+        peaks = sorted(self.levels) if self.probability < SIGNIFICANCE and self.transitions else []
+        return Remark("data.record_rests", {**values, "peaks": peaks, "changes": self.transitions})
 
     def sentence(self) -> str:
         """What was found in a sentence; empty where only one state is supported."""

@@ -38,8 +38,7 @@ MOST_COLUMNS = 4  # wells that are columns of a table; more are rows
 def answer_lines(summary: LandscapeSummary, *, seen: RecordStates | None = None, rung: int = 4) -> list[str]:
     """The answer, and what is to be known of it; `seen` states lead up to `rung` 3, and are left out at 6."""
     elsewhere = seen is not None and rung < 6 and _stays_elsewhere(summary, seen)
-    alone = rung < 4 and len(summary.wells) > 1
-    said = "" if seen is None else seen.sentence() or (sentence(seen.rest()) if alone else "")
+    said = "" if seen is None else seen.sentence() or (sentence(seen.rest()) if rung < 4 else "")
     changes = seen is not None and seen.limit is not None and seen.limit.code == "data.not_stationary"
     return paragraphs("answer.j2", s=summary, seen=said, rung=rung, elsewhere=elsewhere, changes=changes)
 
@@ -47,7 +46,7 @@ def answer_lines(summary: LandscapeSummary, *, seen: RecordStates | None = None,
 def _stays_elsewhere(summary: LandscapeSummary, seen: RecordStates) -> bool:
     """Whether the record has other states than the wells: more, fewer, or off by half of what parts them."""
     if not seen.supported or summary.cycles:
-        return False
+        return seen.supported and len(summary.wells) == 1
     if len(seen.levels) != len(summary.wells):
         return True
     if not len(seen.places) or not set(seen.columns) <= set(summary.names):

@@ -124,8 +124,15 @@ def test_nothing_is_added_to_what_is_certified() -> None:
     limit = Remark("data.not_stationary", {"period": None, "unit": None})
     _, second, *_ = answer_lines(two, seen=replace(seen, levels=(-0.5, 0.5), rung=1, limit=limit), rung=1)
     assert second.startswith("What was identified knows nothing of that change")
-    first, *_ = answer_lines(two, seen=replace(seen, supported=False), rung=0)
-    assert first.startswith("By itself the record shows one state of x")
+    single, one = replace(seen, supported=False), summarise(told(landscape([[-0.5]], [0.25])))
+    for wells in (two, one):
+        first, second, *_ = answer_lines(wells, seen=single, rung=0)
+        assert first.startswith("By itself the record shows one state of x")
+        assert second.startswith("What was identified did not pass every test against the record")
+    # Two peaks that may be no states are told, if no linear noise makes them.
+    assert "It dwells near" in first and f"{seen.transitions} times" in first
+    assert "dwells" not in answer_lines(one, seen=replace(single, probability=0.5), rung=0)[0]
+    assert answer_lines(one, seen=single, rung=4)[0] == answer_lines(one)[0]
 
 
 def test_the_reason_is_that_of_the_step_that_failed() -> None:
