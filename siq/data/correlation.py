@@ -501,8 +501,7 @@ def correlation_time_of(
     """
     series = left.reshape(-1, outputs)
     owner = recording.reshape(-1, outputs)[:, 0]
-    power = float((series**2).mean())
-    total = 1.0
+    power, total = float((series**2).mean()), 1.0
     for lag in range(1, len(series) // 4):
         same = owner[lag:] == owner[:-lag]
         pairs = int(same.sum()) * outputs

@@ -474,8 +474,7 @@ def _label_column(
         remarks.append(Remark("data.label_column", {"column": plain[place]}))
         return place
     times, *columns = (one.to_pandas() for one in source.load([time, *free]))
-    repeated = bool(times.duplicated().any())
-    chosen = None
+    repeated, chosen = bool(times.duplicated().any()), None
     for place, cells in zip(list(free), columns, strict=True):
         words = not pd.api.types.is_numeric_dtype(cells.dtype)
         if words and not cells.dropna().astype(str).str.match(r"\s*[^\W\d_]").all():

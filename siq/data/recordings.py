@@ -322,8 +322,7 @@ class Recordings:
         ValueError
             When `indices` is empty, is a mask, or points outside the recordings.
         """
-        chosen = np.asarray(indices)
-        count = len(self.labels)
+        chosen, count = np.asarray(indices), len(self.labels)
         if chosen.ndim != 1 or chosen.dtype.kind not in "iu" or chosen.size == 0:
             raise ValueError("recordings are selected by a list of at least one index")
         if chosen.min() < 0 or chosen.max() >= count:
@@ -603,8 +602,7 @@ def snapshot_pairs(recordings: Recordings, *, pair_step: float | None = None) ->
     if pair_step is not None and not pair_step > 0:
         raise ValueError(f"pair_step is {pair_step}, but it must be positive")
     t, recording = recordings.t, recordings.recording
-    gap = np.diff(t)
-    keep = recording[1:] == recording[:-1]
+    gap, keep = np.diff(t), recording[1:] == recording[:-1]
     if pair_step is None and keep.any():
         pair_step = recordings.longest_step
     if pair_step is not None:

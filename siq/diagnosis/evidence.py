@@ -108,8 +108,7 @@ def residuals(
 def _blocks_of(recording: np.ndarray, left: np.ndarray, *, least: int) -> np.ndarray:
     """The block of each residual, numbered from 0; recordings are cut into at least so many."""
     recordings = np.unique(recording)
-    block = np.empty(len(recording), dtype=int)
-    begun = 0
+    block, begun = np.empty(len(recording), dtype=int), 0
     for place in recordings:
         rows = np.flatnonzero(recording == place)
         lasting = correlation_time_of(left[rows], recording[rows], least=0.0)
@@ -262,8 +261,7 @@ def evidence_of_function(
     freedom
         Degrees of freedom of the target.
     """
-    total = float(target @ target)
-    values = []
+    total, values = float(target @ target), []
     for length in SMOOTH_LENGTHS:
         along = columns @ np.linalg.cholesky(smooth_prior(knots, length))
         values.append(evidences_by_size(along.T @ along, along.T @ target, total, freedom=freedom)[0])

@@ -84,8 +84,7 @@ def _autocorrelation(left: np.ndarray, recording: np.ndarray, known: np.ndarray,
     owner = recording.reshape(-1, outputs)[:, 0]
     for output in range(outputs):
         y = np.where(whole[:, output], series[:, output], 0.0)
-        power = float(y @ y)
-        size = int(whole[:, output].sum())
+        power, size = float(y @ y), int(whole[:, output].sum())
         if power == 0 or size < 4 * LAGS:
             continue
         for lag in range(1, LAGS + 1):

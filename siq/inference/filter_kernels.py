@@ -142,8 +142,7 @@ def filter_recursion(
     outputs = residual.shape[1]
     width = 1 + columns + dimension
     whitened = np.zeros((rows, outputs, width))
-    log_determinant = 0.0
-    count = len(places)
+    log_determinant, count = 0.0, len(places)
     size = count + outputs if scored else 0
     score = np.zeros(size)
     information, squares = np.zeros((size, size)), np.zeros((size, size))
@@ -367,8 +366,7 @@ def projected_sums(first: np.ndarray, whitened: np.ndarray, kept: int) -> tuple[
     outputs, width = whitened.shape[1:]
     sums = np.zeros((kept, kept))
     own = np.empty((width, width))
-    log_determinant = 0.0
-    removed = 0
+    log_determinant, removed = 0.0, 0
     for recording in range(len(first) - 1):
         own[:] = 0.0
         for k in range(first[recording], first[recording + 1]):
@@ -392,10 +390,8 @@ def _eliminate(products: np.ndarray, kept: int) -> tuple[int, float]:
 
     Only the lower triangle is used. A column of which nothing is left of its own is passed over.
     """
-    width = len(products)
-    scale = np.diag(products).copy()
-    removed = 0
-    logarithm = 0.0
+    width, scale = len(products), np.diag(products).copy()
+    removed, logarithm = 0, 0.0
     for c in range(width - 1, kept - 1, -1):
         pivot = products[c, c]
         if not pivot > 1e-13 * scale[c]:

@@ -212,8 +212,7 @@ class ObservationModel:
             return replace(data, stationary=(1,))
         if self.exposure is None:
             return data
-        d = self.library.dimension
-        ends = data.begins + 1
+        d, ends = self.library.dimension, data.begins + 1
         start = data.t[ends] - self.exposure
         inside = start > data.t[ends - 1] + INSTANT_TOLERANCE * self.exposure
         at, before = ends[inside], np.searchsorted(ends[inside], data.first)

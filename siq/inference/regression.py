@@ -608,8 +608,7 @@ def weighted_triangle(
     left = velocity - regression.predicted(found.values)
     goal = left if of_rest else velocity
     places = all_coefficients(range(d), found.library.size) if places is None else places
-    p = len(places)
-    squares = 0.0
+    p, squares = len(places), 0.0
 
     def rows(begin: int) -> np.ndarray:
         nonlocal squares

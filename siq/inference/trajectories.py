@@ -45,8 +45,7 @@ def _run_tape(
     interval = 0
     for recording in range(len(first) - 1):
         last = interval + first[recording + 1] - first[recording] - 1
-        now = begin[recording].copy()
-        row = first[recording]
+        now, row = begin[recording].copy(), first[recording]
         states[row] = now
         alive = True
         while interval < last and alive:
@@ -170,8 +169,7 @@ def _run_side_by_side(model: Dynamics, grid: Grid, begin: np.ndarray) -> np.ndar
     """Integrate in numpy, all recordings side by side: for formulas that no tape can hold."""
     data = grid.data
     states = np.full((len(data.t), model.dimension), np.nan)
-    lengths = np.diff(data.first)
-    current = begin.T.copy()
+    lengths, current = np.diff(data.first), begin.T.copy()
     states[data.first[:-1]] = begin
     places = np.concatenate([[0], np.cumsum(lengths - 1)])[:-1]
     for sample in range(int(lengths.max()) - 1):
@@ -454,8 +452,7 @@ def spread_edges(model: Dynamics, data: Measurements, x: np.ndarray, *, substeps
     along = function(
         *x.T, *further, *signals.inputs, *signals.delayed, *signals.slopes, signals.t, *model.values
     )
-    rows = data.begins
-    edges = []
+    rows, edges = data.begins, []
     for argument, course in zip(arguments, along, strict=True):
         course = np.broadcast_to(course, data.t.shape)
         known = np.isfinite(moved := course[rows + 1] - course[rows])

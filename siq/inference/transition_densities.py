@@ -238,8 +238,7 @@ def _filtered(
                         low, high = reached[which[k], start]
                         ahead[low:high] += share[start] * matrices[which[k], start, low:high]
                 below[k] = above[k] = 0.0
-            share = np.zeros(count)
-            least = UNLIKELY * ahead.max()
+            share, least = np.zeros(count), UNLIKELY * ahead.max()
             for start in range(count):
                 if ahead[start] < least:
                     continue

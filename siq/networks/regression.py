@@ -160,8 +160,7 @@ def sparse_decomposition(
 
     residual = np.linalg.norm(matrix @ scaled - goals, axis=0) ** 2 + np.linalg.norm(rest, axis=0) ** 2
     size = np.sqrt(np.linalg.norm(goals, axis=0) ** 2 + np.linalg.norm(rest, axis=0) ** 2)
-    coefficients = scaled / ratio
-    d = library.dimension
+    coefficients, d = scaled / ratio, library.dimension
     return _RegressionResult(
         vector_field=coefficients[:, :d], potential=coefficients[:, d], circulatory=coefficients[:, d + 1 :],
         converged=converged, iterations=iterations,

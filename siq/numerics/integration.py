@@ -143,8 +143,7 @@ class FlowMap:
 
     def __call__(self, field: Field, x0: np.ndarray, h: np.ndarray) -> np.ndarray:
         """The state after h without noise: components ``(d, n)`` and steps ``(n,)`` to ``(d, n)``."""
-        step = h / self.steps
-        x = x0
+        step, x = h / self.steps, x0
         with np.errstate(over="ignore", invalid="ignore"):  # a trial f may run away
             for _ in range(self.steps):
                 x = x + step * field(x) if self.euler else runge_kutta_step(field, x, step)

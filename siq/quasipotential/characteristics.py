@@ -330,8 +330,7 @@ def characteristics(
     def reason(before: np.ndarray, after: np.ndarray) -> np.ndarray:
         """An `End` where a step from `before` to `after` leads to one, otherwise -1."""
         y, _, v, frames = flow.parts(after)
-        found = np.full(len(after), -1)
-        x = flow.points(y)
+        found, x = np.full(len(after), -1), flow.points(y)
         found[np.any((x < box[:, 0]) | (x > box[:, 1]), axis=1)] = End.BOX
         found[v >= 1] = End.LEVEL
         found[crossed(flow.parts(before)[3][:, : y.shape[1]], frames[:, : y.shape[1]])] = End.CAUSTIC

@@ -566,8 +566,7 @@ def _rates(
         slope = (noise(beyond)[:, axis, axis] - noise(y[left])[:, axis, axis]) / h
         drift = force(face)[:, axis] - slope
         if dimension == 2:
-            other = 1 - axis
-            move = np.zeros(2)
+            other, move = 1 - axis, np.zeros(2)
             move[other] = steps[other] / 2
             # What the other direction's mixed term carries along this one: ∂(a_xy)/∂y.
             drift = drift - (noise(face + move) - noise(face - move))[:, 0, 1] / steps[other]

@@ -207,8 +207,7 @@ def _eliminate(
     forcing = -_forcing(equation, coefficients, found)
     # Everything depends on the points through a triangular matrix only.
     triangle = np.asarray(np.linalg.qr(np.column_stack([jacobian, goal, forcing]), mode="r"))
-    m = len(coefficients)
-    spread = equation.sizes()
+    m, spread = len(coefficients), equation.sizes()
     size = np.sqrt(equation.diffusion.contract(equation.points, equation.slopes(coefficients)).mean()) or 1.0
     rows = max(len(equation.points) - m, 1)
     active = np.arange(m)

@@ -360,8 +360,7 @@ class HamiltonJacobi:
             along = self.measure.push(self.points, self.slopes(coefficients))
             slant = np.einsum("nd,ndm->m", along, self.gradients) / (len(along) * size)
             jacobian = self.jacobian(coefficients)[:, free] - np.outer(residual, slant[free])
-            matrix = jacobian / (size * scale[free])
-            step = None
+            matrix, step = jacobian / (size * scale[free]), None
             try:  # the normal equations, ten times as fast, where they do: the next step corrects this one
                 normal = matrix.T @ matrix
                 normal[np.diag_indices_from(normal)] *= 1 + damping

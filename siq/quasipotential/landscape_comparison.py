@@ -212,8 +212,7 @@ def compare_estimate(
     number of points; the share of them at which the estimate says something, and its relative L2 error there;
     and that of the formula at every point, whether it is to be believed or not, NaN of others.
     """
-    rows = []
-    values = potential(reference.points)
+    rows, values = [], potential(reference.points)
     for index, attractor in enumerate(reference.attractors):
         inside = reference.below(index, WELL_SHARE)
         at = float(potential(attractor[None])[0])

@@ -413,8 +413,7 @@ def unwound(
     These end at zero; `step` is in units of the shortest time of the flow.
     """
     step = step / np.abs(np.linalg.eigvals(flow)).max()
-    back = scipy.linalg.expm(-step * flow)
-    y = [last]
+    back, y = scipy.linalg.expm(-step * flow), [last]
     while y[-1] @ hessian @ y[-1] > level and len(y) < MOST_NODES:
         y.append(back @ y[-1])
     return np.array(y[::-1]), step * np.arange(1 - len(y), 1)

@@ -290,8 +290,7 @@ def _downhill(
     dynamics: Dynamics, over: LimitSet, begin: np.ndarray, target: LimitSet, box: np.ndarray
 ) -> np.ndarray:
     """The way that f leads on where the one or the other is a cycle."""
-    width = np.ptp(box, axis=1)
-    place = 0
+    width, place = np.ptp(box, axis=1), 0
     if isinstance(over, Cycle):
         place = int(np.argmin(np.linalg.norm((over.points - begin) / width, axis=1)))
     period = next(one.period for one in (target, over) if isinstance(one, Cycle))

@@ -74,8 +74,7 @@ def _cubic_series(dynamics: Dynamics, attractor: np.ndarray) -> tuple[np.ndarray
     symmetric = sum(known.transpose(order) for order in orders) / 6
     triangle, unitary = scipy.linalg.schur(flow, output="complex")
     turned = -3 * np.einsum("abc,ai,bj,ck->ijk", symmetric, unitary, unitary, unitary, optimize=True)
-    one = np.eye(len(flow))
-    cube = np.zeros_like(turned)
+    one, cube = np.eye(len(flow)), np.zeros_like(turned)
     for i in range(len(flow)):
         rest = turned[i] - np.einsum("m,mjk->jk", triangle[:i, i], cube[:i])
         cube[i] = scipy.linalg.solve_sylvester(triangle.T + triangle[i, i] * one, triangle, rest)

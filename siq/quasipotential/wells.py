@@ -393,8 +393,7 @@ def _grow_well(
     quadratic = 0.5 * np.einsum("ni,ij,nj->n", offsets, hessian, offsets).reshape(basin.states.shape[:2])
     size = np.quantile(quadratic[:, 0], 0.5) if depth is None else depth
     basis = PowerBasis.up_to(degree, dynamics.symbols, attractor.position, extent * np.sqrt(2 * size))
-    free = basis.free
-    coefficients = np.zeros(basis.size)
+    free, coefficients = basis.free, np.zeros(basis.size)
     i, j = np.array([np.repeat(np.arange(len(extent)), row) for row in basis.exponents[~free]]).T
     coefficients[~free] = np.where(i == j, 0.5, 1.0) * hessian[i, j] * basis.scale[i] * basis.scale[j]
     values = basis.values(flat) @ coefficients
@@ -441,8 +440,7 @@ def grown(
     spacing = cKDTree(places).query(places, k=2)[0][:, 1]
     ends: list[float] = []
     for _ in range(MAX_ROUNDS):
-        rows = basin.below(values, level)
-        before = len(fitted)
+        rows, before = basin.below(values, level), len(fitted)
         if before:  # far from the last fit V is an extrapolation, and may be low by mistake
             away = cKDTree(places[fitted]).query(places[rows])[0]
             rows = rows[away < POINT_REACH * np.sqrt(2 * level) + 2 * spacing[rows]]

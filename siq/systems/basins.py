@@ -120,8 +120,7 @@ def settled_on(
     x: np.ndarray, cycles: Sequence[Cycle], *, box: np.ndarray, distance: float = SETTLED_DISTANCE
 ) -> np.ndarray:
     """The first of some cycles next to which each state lies, -1 where there is none: shape ``(n,)``."""
-    width = np.ptp(box, axis=1)
-    near = np.full(len(x), -1)
+    width, near = np.ptp(box, axis=1), np.full(len(x), -1)
     for index, one in enumerate(cycles):
         near[(near < 0) & (one.distances(x, scale=width) < distance)] = index
     return near

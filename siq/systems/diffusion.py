@@ -372,8 +372,7 @@ class _Formulas(Diffusion):
         return self._compiled[order](components)
 
     def kicks(self, x: np.ndarray, numbers: np.ndarray) -> np.ndarray:
-        d = self.dimension
-        values = self._values(x, 0)
+        d, values = self.dimension, self._values(x, 0)
         finite = np.isfinite(x).all(axis=0)  # a state that has run away is told by who simulates
         if self._diagonal:
             variances = values[:: d + 1]

@@ -553,8 +553,7 @@ def mesh_potential(
 def _by_rows(function: Callable[[np.ndarray], np.ndarray], axes: Sequence[np.ndarray]) -> np.ndarray:
     """A function of points ``(n, 2)`` on a rectangular mesh, some rows of it at a time."""
     first, second = axes
-    rows = max(CHUNK // len(second), 1)
-    parts = []
+    rows, parts = max(CHUNK // len(second), 1), []
     for row in range(0, len(first), rows):
         points = np.stack(np.meshgrid(first[row : row + rows], second, indexing="ij"), axis=-1)
         parts.append(function(points.reshape(-1, 2)).reshape(*points.shape[:2], -1))
