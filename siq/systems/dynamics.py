@@ -303,7 +303,7 @@ class JointExpectation:
     weight: float = 1.0
 
 
-COMPILED = ("functions", "delays", "free", "only_dividing", "divisors", "symbols", "_lags")
+COMPILED = ("functions", "delays", "free", "divisors", "symbols", "_lags")
 """Cached properties that do not depend on the values of the parameters."""
 
 
@@ -517,25 +517,18 @@ class Dynamics:
         )
 
     @cached_property
-    def only_dividing(self) -> tuple[int, ...]:
-        """Places of free parameters that only divide, as a time constant or K of ``r N (1 - N/K)`` does."""
-        formulas = (*self.equations, *dict(self.outputs).values())
-        powers = set[sympy.Pow]().union(*(each.atoms(sympy.Pow) for each in formulas))
-        below = {one: sympy.S.One for one in powers if one.base.is_Symbol and one.exp == -1}
-        elsewhere = set().union(*(each.xreplace(below).free_symbols for each in formulas))
-        names = {each.base for each in below} - elsewhere
-        return tuple(place for place in self.free if symbol(self.parameters[place].name) in names)
-
-    @cached_property
     def divisors(self) -> dict[int, int | None]:
-        """Places of parameters that only divide, and only some terms, as K of ``r N (1 - N/K)``.
+        """Places of free parameters that only divide, and only some terms, as K of ``r N (1 - N/K)``.
 
         Those terms are absent where it is infinite. With the place of what multiplies them all, r, if that is
         one free parameter. A mass or a time constant divides the whole rate of a state, and is none of them.
         """
         formulas, found = (*self.equations, *dict(self.outputs).values()), dict[int, int | None]()
+        powers = set[sympy.Pow]().union(*(each.atoms(sympy.Pow) for each in formulas))
+        below = {one: sympy.S.One for one in powers if one.base.is_Symbol and one.exp == -1}
+        elsewhere = set().union(*(each.xreplace(below).free_symbols for each in formulas))
         named = {symbol(self.parameters[place].name): place for place in self.free}
-        for one in (each for each, place in named.items() if place in self.only_dividing):
+        for one in named.keys() & {each.base for each in below} - elsewhere:
             parts = [sympy.Add.make_args(each.expand()) for each in formulas if one in each.free_symbols]
             terms = [[term for term in part if 1 / one in term.args] for part in parts]
             if all(0 < len(each) < len(part) for each, part in zip(terms, parts, strict=True)):
@@ -546,15 +539,11 @@ class Dynamics:
     def moved(self, change: np.ndarray) -> Dynamics:
         """The dynamics after a change ``(p,)`` of its free parameters that their slopes ask for.
 
-        What divides a term moves so that f changes straight: ``r'/K' = r/K + d(r/K)``. A time constant that
-        falls does so by its inverse: it never comes to zero, where its state would run away.
+        What divides a term moves so that f changes straight: ``r'/K' = r/K + d(r/K)``.
         """
         values, step = self.values, np.zeros(len(self.parameters))
         step[list(self.free)] = change
         new = values + step
-        for place in {*self.only_dividing} - self.divisors.keys():
-            if step[place] / values[place] < 0:
-                new[place] = values[place] / (1 - step[place] / values[place])
         for place, beside in self.divisors.items():
             weight, more = (1.0, 0.0) if beside is None else (values[beside], step[beside])
             if share := (weight + more - weight * step[place] / values[place]) / values[place]:
