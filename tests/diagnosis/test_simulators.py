@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 
 import siq
+from siq.diagnosis.dictionary import standard_dictionary
 
 CARD: dict[str, Any] = {
     "name": "pendulum",
@@ -84,8 +85,19 @@ def warmings() -> pd.DataFrame:
 def test_a_simulator_gets_what_its_equations_get(
     card: dict[str, Any], simulate: Any, recordings: pd.DataFrame, kept: dict[str, str]
 ) -> None:
-    written = siq.diagnose(siq.load_system(card), recordings)
-    asked = siq.diagnose(card | {"equations": kept}, recordings, simulate=simulate)
+    # What a dictionary of ninety has does not depend on who runs the equations: a few mechanisms are enough.
+    some = {
+        "linear damping",
+        "quadratic drag",
+        "gravity",
+        "decay or leakage",
+        "thermal radiation",
+        "hidden capacity",
+    }
+    without = [each.name for each in standard_dictionary() if each.name not in some]
+    settings = siq.MismatchStudy(without=without)
+    written = siq.diagnose(siq.load_system(card), recordings, settings=settings)
+    asked = siq.diagnose(card | {"equations": kept}, recordings, simulate=simulate, settings=settings)
     assert asked.verdict == written.verdict == "missing physics"
     assert [each.label for each in asked.mechanisms] == [each.label for each in written.mechanisms]
     assert asked.location is not None and written.location is not None
