@@ -177,11 +177,9 @@ def _measurements_of(recordings: Recordings | pd.DataFrame | str | Path, system:
         data = measurements(chosen, system)
     except Fault as error:
         raise error.at(file) from None
-    lengths = np.diff(data.first)
-    if (lengths < MIN_SAMPLES).any():
-        place = f"recording {data.labels[int((lengths < MIN_SAMPLES).argmax())]}"
-        remedy = "leave it out, or join recordings"
-        raise InputError(file, place, f"it has fewer than {MIN_SAMPLES} samples", remedy)
+    if (np.diff(data.first) < MIN_SAMPLES).all():
+        fault, remedy = f"it has fewer than {MIN_SAMPLES} samples", "record more, or join recordings"
+        raise InputError(file, f"recording {data.labels[0]}", fault, remedy)
     return data
 
 
@@ -256,7 +254,11 @@ def comparison_of(
     if settings.noise:
         known = [settings.noise.get(name, np.nan) ** 2 for name in system.output_names]
         data = replace(data, sensor_noise=np.array(known))
-    remarks = []
+    remarks, short = [], np.diff(data.first) < MIN_SAMPLES
+    if short.any():
+        named = [label for label, each in zip(data.labels, short, strict=True) if each]
+        remarks = [Remark("diagnosis.too_short", {"recordings": named, "least": MIN_SAMPLES})]
+        data = data.select(np.flatnonzero(~short).tolist())
     if settings.without_outliers:
         inputs, cleared = data.signals(data.t, data.recording, delays=()).inputs, data.outputs.copy()
         for name, column in zip(system.output_names, cleared.T, strict=True):
@@ -301,6 +303,9 @@ def _split(data: Measurements, study: MismatchStudy, *, file: str) -> tuple[Meas
         # Spread over all of them, so that a drift of the experiment is in both parts.
         out = min(max(round(study.held_out * count), 1), count - 1)
         chosen = set(np.linspace(0, count - 1, 2 * out + 1).round().astype(int)[1::2].tolist())
+        lengths = np.diff(data.first)
+        if 1.5 * lengths[[*chosen]].sum() > lengths.sum():  # what is learned from tells too little
+            chosen = set(np.argsort(lengths, kind="stable")[:out].tolist())
     else:
         for label in study.held_out:
             if label not in data.labels:

@@ -192,6 +192,20 @@ def test_spikes_of_a_sensor_are_left_out_and_told() -> None:
     assert not comparison_of(GROWTH, table, siq.MismatchStudy(without_outliers=False)).remarks
 
 
+def test_short_recordings_are_left_out_and_the_longer_part_is_learned_from() -> None:
+    t = 0.1 * np.arange(90)
+    tables = [
+        pd.DataFrame({"recording": label, "t": t[:count], "n": 0.5 * np.exp(0.3 * t[:count])})
+        for label, count in (("a", 90), ("b", 30), ("c", 5))
+    ]
+    case = comparison_of(GROWTH, pd.concat(tables))
+    assert (case.learn.labels, case.kept.labels) == (("a",), ("b",))
+    (told,) = case.remarks
+    assert "c has fewer than 8 samples, and was left out" in sentence(told)
+    alike = comparison_of(GROWTH, pd.concat([tables[0], tables[0].assign(recording="b")]))
+    assert alike.kept.labels == ("a",) and not alike.remarks
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
