@@ -21,6 +21,7 @@ from siq.inference.budget import Budget
 from siq.inference.measurements import with_expectations
 from siq.inference.recalibration import most_varying, recalibrate
 from siq.numerics.text import value_text
+from siq.remarks import sentence
 from siq.report.diagnosis_page import diagnosis_html, diagnosis_text
 from siq.systems.dynamics import Dynamics, Parameter
 
