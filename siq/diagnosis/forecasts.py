@@ -892,16 +892,21 @@ def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[_Rung], li
 
     def together_with(first: _Leader) -> list[_Rung]:
         """The two that are certain beside each other, where neither is alone."""
-        own, second = first.candidate, next_on([first.candidate], first.horizons)
-        below = None if second is None else _below(second, context)
-        if second is None or below is None:
-            return []
-        again = next_on([below.accepted.best.candidate], below.horizons, asked=own.label)
-        if again is None or _kind_of(again.accepted.best.candidate, model) != _kind_of(own, model):
-            return []
-        if again.accepted.best.candidate.label == own.label:
-            return [again.placed(own, first.horizons), second]
-        return [below, again]
+        own, horizons = first.candidate, first.horizons
+        second = next_on([own], horizons)
+        for _ in range(TRIALS):
+            below = None if second is None else _below(second, context)
+            if second is None or below is None:
+                break
+            plain = below.accepted.best.candidate
+            again = next_on([plain], below.horizons, asked=own.label)
+            if again is not None and again.accepted.best.candidate.label == own.label:
+                return [again.placed(own, horizons), second]
+            if again is not None and _kind_of(again.accepted.best.candidate, model) == _kind_of(own, model):
+                return [below, again]
+            # Beside the second another may be certain: then that is asked in the place of the first.
+            own, horizons, second = plain, [*below.horizons], again
+        return []
 
     try:
         with budget.part(FIRST_NAME_SHARE):
