@@ -19,6 +19,7 @@ there, in its place.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import logging
 from collections import Counter
@@ -370,7 +371,8 @@ def _gained(
                 if not np.isfinite(columns).all():
                     best[place] = np.nan
                 elif columns.any():
-                    best[place] = max(best[place], _density(problem, term, columns) + constant)
+                    with contextlib.suppress(np.linalg.LinAlgError):  # what cannot be told promises nothing
+                        best[place] = max(best[place], _density(problem, term, columns) + constant)
         at += len(some)
     return (best - nothing) / horizon.correlated
 

@@ -6,6 +6,8 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -50,6 +52,7 @@ from siq.diagnosis.holdout import preferred_recalibration
 from siq.diagnosis.mechanisms import MechanismCandidate, candidates_of
 from siq.diagnosis.screening import Probe, Term, linearised_with
 from siq.diagnosis.search import AcceptedMechanism, FitContext
+from siq.diagnosis.terms import Place
 from siq.errors import NumericalFailure
 from siq.inference.budget import Budget
 from siq.inference.kalman_filter import Linearisation, Noise, Whitened, whiten
@@ -326,6 +329,7 @@ def test_a_last_mechanism_that_makes_no_free_run_better_is_taken_back(
     assert found == taken_back == [damped()]
     # One that makes free runs better stays, with those that it stands on.
     rungs = iter([damped(), damped(), None])
+    monkeypatch.setattr(forecasts, "_left_out", lambda *_: None)
     monkeypatch.setattr(forecasts, "_takes_most", lambda *_, **__: True)
     assert climb(fit, context)[1] == [damped(), damped()]
 
@@ -353,6 +357,7 @@ def test_one_that_those_after_it_make_needless_is_climbed_without(monkeypatch: p
         return next(rungs)
 
     monkeypatch.setattr(forecasts, "_next_rung", rung)
+    monkeypatch.setattr(forecasts, "_left_out", lambda *_: None)
     monkeypatch.setattr(forecasts, "_takes_most", lambda *_, **__: True)
     monkeypatch.setattr(forecasts, "_needed", lambda *_: False)
     fit, _ = recalibrate(context.model, context.data)
@@ -439,6 +444,44 @@ def test_two_that_are_certain_only_beside_each_other_are_both_found() -> None:
     assert fit.model.states == ("T", "z_1")
 
 
+def test_of_two_causes_the_first_on_trial_may_be_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A is on trial and b certain on top of it, c on top of b, and b on top of c: b and c are the answer."""
+
+    def candidate(label: str) -> Any:
+        return SimpleNamespace(label=label, generalises=())
+
+    def rung(label: str) -> Any:
+        best = SimpleNamespace(candidate=candidate(label), fit=fit)
+        made = SimpleNamespace(accepted=SimpleNamespace(best=best), horizons=(horizon(label),))
+        made.placed = lambda candidate, _: rung(candidate.label)
+        return made
+
+    def horizon(label: str) -> Any:
+        return SimpleNamespace(fit=fit, alone=label)
+
+    def next_rung(horizons: Any, _: Any, __: Any, ___: Any, on_trial: Any = None, asked: str = "") -> Any:
+        below = horizons[0].alone
+        calls.append((below, asked))
+        if on_trial is not None:
+            on_trial.append(SimpleNamespace(candidate=candidate("a"), horizons=[horizon("a")]))
+        return {"a": rung("b"), "b": rung("c"), "c": rung("b")}.get(below) if len(calls) < 5 else None
+
+    fit: Any = SimpleNamespace(model=pendulum(), noise=None)
+    calls: list[tuple[str, str]] = []
+    monkeypatch.setattr(forecasts, "_next_rung", next_rung)
+    monkeypatch.setattr(forecasts, "_horizons_of", lambda *_: [horizon("")])
+    monkeypatch.setattr(forecasts, "_below", lambda above, _: rung(above.accepted.best.candidate.label))
+    monkeypatch.setattr(forecasts, "_kind_of", lambda one, _: one.label)
+    monkeypatch.setattr(forecasts, "_left_out", lambda *_: None)
+    monkeypatch.setattr(forecasts, "_takes_most", lambda *_, **__: True)
+    monkeypatch.setattr(forecasts, "_needed", lambda *_: True)
+    monkeypatch.setattr(forecasts, "_exchanged", lambda found, *_: found)
+    context = replace(context_of(pendulum(), recorded(0.15, 0.2), CLOSE), candidates=())
+    _, found, *_ = climb(fit, context)
+    assert [each.accepted.best.candidate.label for each in found] == ["b", "c"]
+    assert calls[:4] == [("", ""), ("a", ""), ("b", "a"), ("c", "b")]
+
+
 def test_a_lag_and_a_hidden_capacity_each_with_a_state_are_found_one_on_the_other() -> None:
     """A room whose walls take up heat, and a sensor that follows late."""
     draw, t, h = np.random.default_rng(6), np.arange(150) / 12, 1 / 120
@@ -492,6 +535,18 @@ def test_odds_with_a_flat_prior_are_those_of_mechanisms_that_are_alike() -> None
     assert flat.log_odds == pytest.approx(flat.flat_log_odds)
     assert damped().flat_log_odds == pytest.approx(flat.log_odds, abs=0.05)
     assert damped().log_odds > damped().flat_log_odds  # nearly everything that moves is damped
+
+
+def test_what_cannot_be_told_promises_nothing_and_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    def density(problem: Any, term: Probe | Place, columns: np.ndarray) -> float:
+        if isinstance(term, Place):
+            raise np.linalg.LinAlgError("Singular matrix")
+        return told(problem, term, columns)
+
+    told = forecasts._density
+    monkeypatch.setattr(forecasts, "_density", density)
+    found = first_rung(context_of(pendulum(), recorded(0.15, 0.2), CLOSE))
+    assert found is not None and found.accepted.best.candidate.name == "linear damping"
 
 
 def test_forces_that_last_have_no_name_in_the_dictionary() -> None:
