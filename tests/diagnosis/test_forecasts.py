@@ -329,7 +329,6 @@ def test_a_last_mechanism_that_makes_no_free_run_better_is_taken_back(
     assert found == taken_back == [damped()]
     # One that makes free runs better stays, with those that it stands on.
     rungs = iter([damped(), damped(), None])
-    monkeypatch.setattr(forecasts, "_left_out", lambda *_: None)
     monkeypatch.setattr(forecasts, "_takes_most", lambda *_, **__: True)
     assert climb(fit, context)[1] == [damped(), damped()]
 
@@ -357,7 +356,6 @@ def test_one_that_those_after_it_make_needless_is_climbed_without(monkeypatch: p
         return next(rungs)
 
     monkeypatch.setattr(forecasts, "_next_rung", rung)
-    monkeypatch.setattr(forecasts, "_left_out", lambda *_: None)
     monkeypatch.setattr(forecasts, "_takes_most", lambda *_, **__: True)
     monkeypatch.setattr(forecasts, "_needed", lambda *_: False)
     fit, _ = recalibrate(context.model, context.data)
