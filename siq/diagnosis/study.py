@@ -304,7 +304,7 @@ def _split(data: Measurements, study: MismatchStudy, *, file: str) -> tuple[Meas
         out = min(max(round(study.held_out * count), 1), count - 1)
         chosen = set(np.linspace(0, count - 1, 2 * out + 1).round().astype(int)[1::2].tolist())
         lengths = np.diff(data.first)
-        if 1.5 * lengths[[*chosen]].sum() > lengths.sum():  # what is learned from tells too little
+        if 1.5 * lengths[[*chosen]].sum() > lengths.sum():  # a third, a choice, tells too little
             chosen = set(np.argsort(lengths, kind="stable")[:out].tolist())
     else:
         for label in study.held_out:
